@@ -1,0 +1,136 @@
+"""What a controller is, and the catalogue of the paper's six."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from biped_mfpt_ros.control import hzd, smc
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.walker.robot import Robot
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """A low-level control scheme.
+
+    Attributes
+    ----------
+    code : int
+        By which the kernels know it.
+    parameters : tuple of str
+        Names of its parameters, in order.
+    optional : int
+        How many more values may follow them.
+    packed : callable
+        Parameters and robot to the array that the kernels read; raises InputError.
+    """
+
+    code: int
+    parameters: tuple[str, ...]
+    optional: int
+    packed: Callable[[np.ndarray, Robot], np.ndarray]
+
+
+HZD, SMC = 0, 1
+
+SCHEMES = {
+    "hzd": Scheme(HZD, hzd.PARAMETERS, 1, hzd.packed),
+    "smc": Scheme(SMC, smc.PARAMETERS, 0, smc.packed),
+}
+"""Every scheme by its name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """A control scheme with its parameters.
+
+    Attributes
+    ----------
+    name : str
+        Label, such as ``"hzd/base"``.
+    scheme : str
+        A key of `SCHEMES`.
+    parameters : numpy.ndarray
+        float64, read-only, in the order of the scheme's ``parameters``.
+
+    Raises
+    ------
+    InputError
+        If the scheme is unknown, or the parameters have the wrong length or are not finite.
+    """
+
+    name: str
+    scheme: str
+    parameters: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check scheme, length and values, and freeze the parameters."""
+        if self.scheme not in SCHEMES:
+            raise InputError("scheme", self.scheme, "one of " + ", ".join(SCHEMES))
+        scheme = SCHEMES[self.scheme]
+        values = np.array(self.parameters, dtype=np.float64)
+        least, most = len(scheme.parameters), len(scheme.parameters) + scheme.optional
+        if values.ndim != 1 or not least <= values.size <= most:
+            lengths = f"{least}" if least == most else f"{least} to {most}"
+            raise InputError(
+                "parameters", f"length {values.size}", f"{lengths} numbers for scheme {self.scheme}"
+            )
+        # Only the optional ones may be infinite: they are limits.
+        bad = np.isnan(values) | (np.isinf(values) & (np.arange(values.size) < least))
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise InputError(f"parameters[{i}]", float(values[i]), "finite numbers")
+        values.setflags(write=False)
+        object.__setattr__(self, "parameters", values)
+
+    def packed(self, robot: Robot) -> np.ndarray:
+        """Parameters as the kernels read them, float64; raises InputError."""
+        return SCHEMES[self.scheme].packed(self.parameters, robot)
+
+    @property
+    def code(self) -> int:
+        """By which the kernels know the scheme."""
+        return SCHEMES[self.scheme].code
+
+
+@cache
+def catalogue() -> dict[str, Controller]:
+    """The six controllers of Tables 1 and 3, by name."""
+    data = json.loads(files("biped_mfpt_ros").joinpath("data/controllers.json").read_text())
+    out = {}
+    for label, row in data["hzd"]["controllers"].items():
+        values: Sequence[float] = [row["kp"], row["kd"], *np.ravel(row["bezier"])]
+        out[f"hzd/{label}"] = Controller(f"hzd/{label}", "hzd", np.array(values))
+    for label, row in data["smc"]["controllers"].items():
+        values = [
+            math.radians(row[f"{name}_deg"]) if f"{name}_deg" in row else row[name]
+            for name in smc.PARAMETERS
+        ]
+        out[f"smc/{label}"] = Controller(f"smc/{label}", "smc", np.array(values))
+    return out
+
+
+def controller_names() -> tuple[str, ...]:
+    """Names of the catalogue."""
+    return tuple(catalogue())
+
+
+def controller(name: str) -> Controller:
+    """Controller of the catalogue.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    try:
+        return catalogue()[name]
+    except KeyError:
+        raise InputError("controller", name, "one of " + ", ".join(catalogue())) from None

@@ -1,0 +1,220 @@
+"""Hybrid zero dynamics with PD control, section 3.1 of the paper.
+
+The four relative angles q1 to q4 follow Bezier polynomials of the phase variable
+``theta = c q = -(a_1 + a_3) / 2`` (eq. 11 to 13), with computed torques that leave
+``ddh = -K_P h - K_D dh`` (eq. 8 to 10).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.walker.dynamics import ALPHA, BETA
+from biped_mfpt_ros.walker.impact import impact_map
+from biped_mfpt_ros.walker.robot import ABSOLUTE, Robot, rabbit
+
+DEGREE = 6
+"""M of eq. (12)."""
+
+PARAMETERS = ("kp", "kd") + tuple(
+    f"alpha_{k}^{i}" for i in range(1, 5) for k in range(DEGREE + 1)
+)
+"""Names of the parameters, in order: gains (1/s^2, 1/s), then coefficients (rad) joint by joint."""
+
+# Offsets into the packed parameters.
+_KP, _KD, _THETA_START, _SLOPE, _OFF, _MONOMIAL = 0, 1, 2, 3, 4, 5
+PACKED_SIZE = _MONOMIAL + 4 * (DEGREE + 1)
+
+
+@kernel
+def command(par, work, y):
+    """Accelerations ``alpha + beta z`` with ``z = ddtheta``, into the workspace (eq. 8 to 13)."""
+    theta = -0.5 * (y[0] + y[2])
+    rate = -0.5 * (y[5] + y[7])
+    tau = (theta - par[_THETA_START]) * par[_SLOPE]
+    tau_rate = rate * par[_SLOPE]
+    for i in range(4):
+        k = _MONOMIAL + i * (DEGREE + 1)
+        value = par[k + DEGREE]
+        first = 0.0
+        second = 0.0
+        for n in range(DEGREE - 1, -1, -1):
+            second = second * tau + first
+            first = first * tau + value
+            value = value * tau + par[k + n]
+        base = 4 if i < 2 else i - 2
+        error = y[i] - y[base] - value
+        error_rate = y[5 + i] - y[5 + base] - first * tau_rate
+        work[BETA, i] = first * par[_SLOPE]
+        work[ALPHA, i] = (
+            2.0 * second * tau_rate * tau_rate - par[_KP] * error - par[_KD] * error_rate
+        )
+    # ddq_i = A_i + B_i z and z = -ddq_1 - ddq_3 / 2 - ddq_5 give the torso, then the other links.
+    alpha5 = -work[ALPHA, 0] - 0.5 * work[ALPHA, 2]
+    beta5 = -1.0 - work[BETA, 0] - 0.5 * work[BETA, 2]
+    work[ALPHA, 4] = alpha5
+    work[BETA, 4] = beta5
+    for i in range(2):
+        work[ALPHA, i] += alpha5
+        work[BETA, i] += beta5
+    for i in range(2, 4):
+        work[ALPHA, i] += work[ALPHA, i - 2]
+        work[BETA, i] += work[BETA, i - 2]
+
+
+@kernel
+def switch(par, y):
+    """Positive as long as torques are applied: ``tau_off - tau``."""
+    if par[_OFF] == math.inf:
+        return 1.0
+    tau = (-0.5 * (y[0] + y[2]) - par[_THETA_START]) * par[_SLOPE]
+    return par[_OFF] - tau
+
+
+def double_support(joints: np.ndarray, robot: Robot) -> np.ndarray:
+    """Angles with both feet on flat ground.
+
+    Parameters
+    ----------
+    joints : numpy.ndarray
+        q1 to q4, rad, shape (4,).
+    robot : Robot
+        The links.
+
+    Returns
+    -------
+    numpy.ndarray
+        q1 to q5, rad, shape (5,): the torso angle for which the swing foot is level with and ahead
+        of the stance foot.
+    """
+    q = np.append(joints, 0.0)
+    a = ABSOLUTE @ q
+    foot = robot.swing_foot_position
+    x, y = -foot @ np.sin(a), foot @ np.cos(a)
+    # Turning the whole robot by -phi brings a foot that stands at angle phi to angle zero.
+    q[4] = -math.atan2(y, x)
+    return q
+
+
+def phase(q: np.ndarray) -> float:
+    """Phase variable theta = c q, rad, for joint angles of shape (5,)."""
+    return float(-q[0] - 0.5 * q[2] - q[4])
+
+
+def swapped(q: np.ndarray) -> np.ndarray:
+    """Joint angles or rates, shape (5,), with the legs' roles exchanged."""
+    return q[[1, 0, 3, 2, 4]]
+
+
+def phase_range(bezier: np.ndarray, robot: Robot) -> tuple[float, float]:
+    """theta+ and theta- of eq. (11), rad: the phase at start and end of a step on flat ground."""
+    end = double_support(bezier[:, DEGREE], robot)
+    return phase(swapped(end)), phase(end)
+
+
+def hybrid_invariant_start(
+    alpha5: np.ndarray, alpha6: np.ndarray, robot: Robot | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients alpha_0 and alpha_1 that hybrid invariance demands (section 3.1, [12]).
+
+    Without tracking error just before an impact on flat ground there shall be none just after it.
+
+    Parameters
+    ----------
+    alpha5, alpha6 : numpy.ndarray
+        Last two coefficients of q1 to q4, rad, shape (4,).
+    robot : Robot, optional
+        The links; RABBIT by default.
+
+    Returns
+    -------
+    alpha0, alpha1 : numpy.ndarray
+        First two coefficients of q1 to q4, rad, shape (4,).
+    """
+    robot = robot or rabbit()
+    q = double_support(alpha6, robot)
+    theta_end, theta_start = phase(q), phase(swapped(q))
+    span = theta_end - theta_start
+    rates = np.empty(5)
+    rates[:4] = DEGREE * (alpha6 - alpha5) / span  # for dtheta = 1
+    rates[4] = -1.0 - rates[0] - 0.5 * rates[2]
+    after, _ = impact_map(np.concatenate([q, rates]), robot)
+    alpha0 = after[:4]
+    alpha1 = alpha0 + after[5:9] / phase(after[5:]) * span / DEGREE
+    return alpha0, alpha1
+
+
+def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.ndarray:
+    """State just after an impact on flat ground, without tracking error.
+
+    Parameters
+    ----------
+    parameters : numpy.ndarray
+        As `PARAMETERS`.
+    rate : float
+        dtheta just before the impact, rad/s.
+    robot : Robot
+        The links.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``[q, dq]``, rad and rad/s, shape (10,).
+    """
+    bezier = parameters[2 : 2 + 4 * (DEGREE + 1)].reshape(4, DEGREE + 1)
+    q = double_support(bezier[:, DEGREE], robot)
+    span = phase(q) - phase(swapped(q))
+    rates = np.empty(5)
+    rates[:4] = DEGREE * (bezier[:, DEGREE] - bezier[:, DEGREE - 1]) / span * rate
+    rates[4] = -rate - rates[0] - 0.5 * rates[2]
+    return impact_map(np.concatenate([q, rates]), robot)[0]
+
+
+def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
+    """Parameters as the kernels read them.
+
+    Parameters
+    ----------
+    parameters : numpy.ndarray
+        As `PARAMETERS`, shape (30,), or with one more: the phase tau above which no torque is
+        applied (section 6.3 of the paper), shape (31,).
+    robot : Robot
+        The links; they fix theta+ and theta-.
+
+    Returns
+    -------
+    numpy.ndarray
+        float64, shape (PACKED_SIZE,).
+
+    Raises
+    ------
+    InputError
+        If a gain is not positive or the phase does not advance over the step.
+    """
+    for name, value in zip(PARAMETERS[:2], parameters[:2], strict=True):
+        if value <= 0.0:
+            raise InputError(f"parameters[{name}]", float(value), "> 0")
+    bezier = parameters[2 : 2 + 4 * (DEGREE + 1)].reshape(4, DEGREE + 1)
+    start, end = phase_range(bezier, robot)
+    if not abs(end - start) > 1e-6:
+        raise InputError("parameters[alpha_6]", bezier[:, DEGREE].tolist(), "legs that are apart")
+    out = np.empty(PACKED_SIZE)
+    out[[_KP, _KD]] = parameters[:2]
+    out[_THETA_START] = start
+    out[_SLOPE] = 1.0 / (end - start)
+    out[_OFF] = parameters[-1] if parameters.size > len(PARAMETERS) else math.inf
+    out[_MONOMIAL:] = (bezier @ _bernstein_to_monomial()).ravel()
+    return out
+
+
+def _bernstein_to_monomial() -> np.ndarray:
+    """Matrix from Bernstein to monomial coefficients, shape (DEGREE + 1, DEGREE + 1)."""
+    matrix = np.zeros((DEGREE + 1, DEGREE + 1))
+    for k in range(DEGREE + 1):
+        for n in range(k, DEGREE + 1):
+            matrix[k, n] = (-1.0) ** (n - k) * math.comb(DEGREE, n) * math.comb(n, k)
+    return matrix

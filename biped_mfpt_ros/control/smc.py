@@ -1,0 +1,156 @@
+"""Sliding mode control with piecewise constant references, section 3.2 of the paper.
+
+The outputs theta_2 = q2 + q5, q3, q4 and q5 (eq. 14) are driven to references that switch once, as
+the stance femur passes the vertical (eq. 22), by ``v = -k |sigma|^(2 alpha - 1) sign(sigma)`` with
+``sigma = dh + h / tau`` (eq. 18, 21).
+
+The law near sigma = 0
+----------------------
+There the exponent below one makes the law infinitely steep. An output in sliding mode rests where
+``v = -dh / tau``, on the slow manifold ``sigma_s = sign(dh) (|dh| / (tau k))^(1 / (2 alpha - 1))``,
+which tends to sigma = 0 as the output comes to rest, and is drawn to it ever faster. No explicit
+integrator can follow that, nor is it of interest how fast it happens. So the secant slope of the
+law about the slow manifold is bounded by `SLIDING_RATE`: further off than that, the law is
+eq. (21) to the letter; closer, the output comes to the same manifold within ``1 / SLIDING_RATE``,
+later by less than a step of the integrator. Where 2 alpha - 1 <= 0, outside of what the paper
+allows but present in its Table 3, sigma = 0 itself is the sliding manifold (Filippov).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.walker.dynamics import ALPHA, BETA
+from biped_mfpt_ros.walker.robot import Robot
+
+PARAMETERS = (
+    "theta2_ref1",
+    "theta2_ref2",
+    "q3_ref",
+    "q4_ref1",
+    "q4_ref2",
+    "theta5_ref",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "alpha1",
+    "alpha2",
+    "alpha3",
+    "alpha4",
+    "tau1",
+    "tau2",
+    "tau3",
+    "tau4",
+)
+"""Names of the parameters, in order: references (rad), k_i, alpha_i, tau_i (s)."""
+
+SLIDING_RATE = 2000.0
+"""1/s, the steepest secant of the law about its slow manifold."""
+
+# Offsets into the packed parameters: references before and after the switch, then k, 2 alpha - 1,
+# 1 / tau, and the half width about sigma = 0 of a law without a slow manifold.
+_REF1, _REF2, _K, _EXPONENT, _RATE = 0, 4, 8, 12, 16
+PACKED_SIZE = 20
+_TINY = 1e-9
+
+
+@kernel
+def _law(sigma, rate, k, exponent):
+    """-v of eq. (21) for one output; ``rate`` is dh / tau."""
+    size = abs(sigma)
+    if exponent > 0.0:
+        law = math.copysign(k * size**exponent, sigma)
+        slow = math.copysign((abs(rate) / k) ** (1.0 / exponent), rate)
+    else:
+        law = math.copysign(k * max(size, _TINY) ** exponent, sigma)
+        slow = 0.0
+        if abs(rate) >= k * max(size, _TINY) ** exponent:
+            # Too fast to slide: the law is discontinuous, and only crossed.
+            return law * min(1.0, size / _TINY)
+    excess = law - rate
+    bound = SLIDING_RATE * abs(sigma - slow)
+    if abs(excess) > bound:
+        return rate + math.copysign(bound, excess)
+    return law
+
+
+@kernel
+def command(par, work, y, after_switch):
+    """Accelerations ``alpha + beta z`` with ``z`` that of the stance femur, into the workspace."""
+    ref = _REF2 if after_switch else _REF1
+    for i in range(4):
+        if i == 0:
+            value, rate = y[1], y[6]
+        elif i == 1:
+            value, rate = y[2] - y[0], y[7] - y[5]
+        elif i == 2:
+            value, rate = y[3] - y[1], y[8] - y[6]
+        else:
+            value, rate = y[4], y[9]
+        error = value - par[ref + i]
+        inverse_tau = par[_RATE + i]
+        sigma = rate + error * inverse_tau
+        v = -_law(sigma, rate * inverse_tau, par[_K + i], par[_EXPONENT + i])
+        if i == 0:
+            work[ALPHA, 1] = v
+            work[ALPHA, 3] = v
+        elif i == 1:
+            work[ALPHA, 2] = v
+        elif i == 2:
+            work[ALPHA, 3] += v
+        else:
+            work[ALPHA, 4] = v
+    work[ALPHA, 0] = 0.0
+    work[BETA, 0] = 1.0
+    work[BETA, 1] = 0.0
+    work[BETA, 2] = 1.0
+    work[BETA, 3] = 0.0
+    work[BETA, 4] = 0.0
+
+
+@kernel
+def switch(par, y):
+    """Positive before the switch of the references: theta_1 - pi (eq. 22)."""
+    return y[0] - math.pi
+
+
+def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
+    """Parameters as the kernels read them.
+
+    Parameters
+    ----------
+    parameters : numpy.ndarray
+        As `PARAMETERS`, shape (18,).
+    robot : Robot
+        Not needed; every scheme is packed alike.
+
+    Returns
+    -------
+    numpy.ndarray
+        float64, shape (PACKED_SIZE,).
+
+    Raises
+    ------
+    InputError
+        If a k_i or tau_i is not positive, or an alpha_i is not between 0 and 1.
+    """
+    named = dict(zip(PARAMETERS, parameters.tolist(), strict=True))
+    for name, value in named.items():
+        if name[0] == "k" or name.startswith("tau"):
+            if value <= 0.0:
+                raise InputError(f"parameters[{name}]", value, "> 0")
+        elif name.startswith("alpha") and not 0.25 <= value <= 1.0:
+            raise InputError(f"parameters[{name}]", value, "0.25 to 1 (above 0.5 in the paper)")
+    out = np.empty(PACKED_SIZE)
+    ref1, ref2, q3, q4_1, q4_2, torso = parameters[:6]
+    out[_REF1 : _REF1 + 4] = ref1, q3, q4_1, torso
+    out[_REF2 : _REF2 + 4] = ref2, q3, q4_2, torso
+    out[_K : _K + 4] = parameters[6:10]
+    out[_EXPONENT : _EXPONENT + 4] = 2.0 * parameters[10:14] - 1.0
+    out[_RATE : _RATE + 4] = 1.0 / parameters[14:18]
+    return out

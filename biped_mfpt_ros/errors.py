@@ -1,0 +1,26 @@
+"""The one error for input that is not allowed."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """A value given by the user or by another node is not allowed.
+
+    Parameters
+    ----------
+    field : str
+        Name of the field, parameter, option or file that holds the value.
+    value : object
+        The value itself; long ones are shortened in the text.
+    allowed : str
+        What would have been allowed.
+    """
+
+    def __init__(self, field: str, value: object, allowed: str) -> None:
+        self.field = field
+        self.value = value
+        self.allowed = allowed
+        shown = repr(value)
+        if len(shown) > 200:
+            shown = shown[:197] + "..."
+        super().__init__(f"{field}: {shown} is not allowed; allowed: {allowed}")

@@ -1,0 +1,1 @@
+"""Walking: one step under a controller, limit cycles, walks on random slopes."""

@@ -1,0 +1,45 @@
+"""Compilation of the numeric kernels, and the identity of the step map they make up.
+
+Numba decides from a function's own file whether its cached machine code is still good, and does
+not see changes in the functions that it calls from other files. So the cache directory carries a
+digest of every kernel source: any change gives a fresh directory, and nothing stale is ever run.
+The same digest, with the robot's data, identifies the step map to other processes: two processes
+with equal `STEP_MAP` compute the same steps.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import numba
+
+from biped_mfpt_ros import __version__
+
+_PACKAGE = Path(__file__).parent
+# What decides the result of a step: the kernels and the robot's data.
+_STEP_SOURCES = ("walker/*.py", "control/*.py", "gait/step.py", "data/rabbit.json", "jit.py")
+_KERNEL_SOURCES = (*_STEP_SOURCES, "gait/*.py", "chain/*.py")
+
+
+def _digest(patterns: tuple[str, ...]) -> str:
+    digest = hashlib.sha256()
+    for pattern in patterns:
+        for path in sorted(_PACKAGE.glob(pattern)):
+            digest.update(str(path.relative_to(_PACKAGE)).encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+STEP_MAP: str = f"{__version__}+{_digest(_STEP_SOURCES)}"
+"""Version and digest of the code and data that simulate a step."""
+
+CACHE_DIR = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "biped_mfpt_ros"
+"""Where compiled kernels are kept, in one directory for each state of the kernel sources."""
+
+if not os.environ.get("NUMBA_CACHE_DIR"):
+    numba.config.CACHE_DIR = str(CACHE_DIR / f"{numba.__version__}-{_digest(_KERNEL_SOURCES)}")
+
+kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+"""Decorator of every numeric kernel: compiled once, cached on disk, run without the GIL."""

@@ -1,0 +1,1 @@
+"""The robot: links, dynamics, impact, terrain, and how a step can end."""
