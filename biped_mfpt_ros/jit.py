@@ -19,8 +19,8 @@ from biped_mfpt_ros import __version__
 
 _PACKAGE = Path(__file__).parent
 # What decides the result of a step: the kernels and the robot's data.
-_STEP_SOURCES = ("walker/*.py", "control/*.py", "gait/step.py", "data/rabbit.json", "jit.py")
-_KERNEL_SOURCES = (*_STEP_SOURCES, "gait/*.py", "chain/*.py")
+_STEP_SOURCES = ("walker/*.py", "control/*.py", "gait/*.py", "data/rabbit.json", "jit.py")
+_KERNEL_SOURCES = (*_STEP_SOURCES, "chain/*.py")
 
 
 def _digest(patterns: tuple[str, ...]) -> str:

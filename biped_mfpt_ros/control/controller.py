@@ -30,19 +30,23 @@ class Scheme:
         How many more values may follow them.
     packed : callable
         Parameters and robot to the array that the kernels read; raises InputError.
+    reference_state : callable
+        Parameters, a rate (rad/s) and robot to a state just after an impact on flat ground without
+        tracking error: where a search for the limit cycle may start.
     """
 
     code: int
     parameters: tuple[str, ...]
     optional: int
     packed: Callable[[np.ndarray, Robot], np.ndarray]
+    reference_state: Callable[[np.ndarray, float, Robot], np.ndarray]
 
 
 HZD, SMC = 0, 1
 
 SCHEMES = {
-    "hzd": Scheme(HZD, hzd.PARAMETERS, 1, hzd.packed),
-    "smc": Scheme(SMC, smc.PARAMETERS, 0, smc.packed),
+    "hzd": Scheme(HZD, hzd.PARAMETERS, 1, hzd.packed, hzd.reference_state),
+    "smc": Scheme(SMC, smc.PARAMETERS, 0, smc.packed, smc.reference_state),
 }
 """Every scheme by its name."""
 
@@ -93,6 +97,10 @@ class Controller:
     def packed(self, robot: Robot) -> np.ndarray:
         """Parameters as the kernels read them, float64; raises InputError."""
         return SCHEMES[self.scheme].packed(self.parameters, robot)
+
+    def reference_state(self, rate: float, robot: Robot) -> np.ndarray:
+        """State just after an impact on flat ground without tracking error, shape (10,)."""
+        return SCHEMES[self.scheme].reference_state(self.parameters, rate, robot)
 
     @property
     def code(self) -> int:

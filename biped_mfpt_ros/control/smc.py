@@ -25,6 +25,7 @@ import numpy as np
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.walker.dynamics import ALPHA, BETA
+from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot
 
 PARAMETERS = (
@@ -117,6 +118,34 @@ def command(par, work, y, after_switch):
 def switch(par, y):
     """Positive before the switch of the references: theta_1 - pi (eq. 22)."""
     return y[0] - math.pi
+
+
+def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.ndarray:
+    """State just after an impact on flat ground, every output at rest on its reference.
+
+    Parameters
+    ----------
+    parameters : numpy.ndarray
+        As `PARAMETERS`.
+    rate : float
+        How fast the stance femur turns forward just before the impact, rad/s.
+    robot : Robot
+        The links.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``[q, dq]``, rad and rad/s, shape (10,).
+    """
+    _, theta2, q3, _, q4, q5 = parameters[:6]
+    femur, tibia = robot.femur_length, robot.tibia_length
+    # Height of the hip above the swing foot, and the stance femur that gives it with q3.
+    height = -femur * math.cos(theta2) - tibia * math.cos(theta2 + q4)
+    reach = math.sqrt(femur**2 + tibia**2 + 2.0 * femur * tibia * math.cos(q3))
+    bend = math.atan2(tibia * math.sin(q3), femur + tibia * math.cos(q3))
+    theta1 = math.pi - math.acos(max(-1.0, min(1.0, height / reach))) - bend
+    state = np.array([theta1 - q5, theta2 - q5, q3, q4, q5, -rate, 0.0, 0.0, 0.0, 0.0])
+    return impact_map(state, robot)[0]
 
 
 def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:

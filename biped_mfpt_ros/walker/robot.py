@@ -202,7 +202,7 @@ class WalkerModel:
     friction: float = 0.6
     slip_duration: float = 0.0
     time_limit: float = 3.0
-    tolerance: float = 1e-8
+    tolerance: float = 1e-9
     robot: Robot = field(default_factory=rabbit)
 
     def __post_init__(self) -> None:
