@@ -10,7 +10,7 @@ VERSION = re.search(r'__version__ = "(.+)"', Path(NAME, "__init__.py").read_text
 setup(
     name=NAME,
     version=VERSION,
-    description="Mean first-passage time to a fall of a five-link biped on rough ground, over ROS 2",
+    description="Mean first-passage time to a fall of a five-link biped on rough ground",
     license="Apache-2.0",
     maintainer="biped_mfpt_ros maintainers",
     maintainer_email="maintainers@example.org",
