@@ -1,0 +1,109 @@
+"""What every node's ``main`` does: start, spin, stop cleanly."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from types import FrameType
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions, install_signal_handlers
+
+from biped_mfpt_ros.errors import InputError
+
+
+def prepare_environment() -> None:
+    """Set what must be decided before rclpy starts: who is discovered, and who gets in.
+
+    Discovery stays on this machine unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise.
+
+    Raises
+    ------
+    InputError
+        If security is asked for in a way that would go on without it.
+    """
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    enabled = os.environ.get("ROS_SECURITY_ENABLE", "false").lower() == "true"
+    strategy = os.environ.get("ROS_SECURITY_STRATEGY", "Permissive")
+    # Permissive, the default, goes on unsecured without a word where the middleware has no
+    # security or the keystore no enclave. Enforce fails then.
+    if enabled and strategy != "Enforce":
+        raise InputError(
+            "ROS_SECURITY_STRATEGY", strategy, "Enforce, when ROS_SECURITY_ENABLE is true"
+        )
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
+    """Run one node until SIGINT, SIGTERM, or the end of its context.
+
+    A node with a method ``close()`` has it called before it is destroyed, to end its threads.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the node, after rclpy has started. It may take long.
+    args : list of str, optional
+        Arguments with ROS remappings and parameters; the command line by default.
+
+    Returns
+    -------
+    int
+        Exit code: 0 after a clean stop, 2 if the node could not start as configured.
+    """
+    # Until the node spins, a signal raises in Python: rclpy's own handlers only act on a spin.
+    signal.signal(signal.SIGTERM, _interrupt)
+    node: Node | None = None
+    try:
+        prepare_environment()
+        try:
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            node = make()
+        except (InputError, KeyboardInterrupt):
+            raise
+        except Exception as error:
+            if os.environ.get("ROS_SECURITY_ENABLE", "").lower() != "true":
+                raise
+            raise InputError(
+                "ROS_SECURITY_ENABLE",
+                "true",
+                f"false, unless this ROS 2 has DDS security and the enclave exists ({error})",
+            ) from error
+        install_signal_handlers(SignalHandlerOptions.ALL)
+        _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except InputError as error:
+        print(f"{sys.argv[0]}: {error}", file=sys.stderr)
+        return 2
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the rest is quick and must not be cut off
+        if node is not None:
+            close = getattr(node, "close", None)
+            if close is not None:
+                close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _spin(node: Node) -> None:
+    """Spin until the context ends. What goes wrong with one caller must not end the node."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while node.context.ok():
+        try:
+            executor.spin()
+        except (KeyboardInterrupt, ExternalShutdownException):
+            raise
+        except Exception:
+            # A client that has gone before its answer, a message that cannot be converted.
+            node.get_logger().error(f"a callback failed; going on\n{traceback.format_exc()}")
