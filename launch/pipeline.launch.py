@@ -10,6 +10,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 PACKAGE = "biped_mfpt_ros"
 
@@ -58,8 +59,8 @@ def generate_launch_description() -> LaunchDescription:
         package=PACKAGE,
         executable="recorder",
         namespace=namespace,
-        # The quotes keep a name such as 2024 a string.
-        parameters=[{"bag": ["'", LaunchConfiguration("bag"), "'"]}],
+        # Without its type a name such as 2024 would become a number.
+        parameters=[{"bag": ParameterValue(LaunchConfiguration("bag"), value_type=str)}],
         condition=IfCondition(LaunchConfiguration("record")),
         output="screen",
     )
@@ -67,5 +68,5 @@ def generate_launch_description() -> LaunchDescription:
         Node(package=PACKAGE, executable=name, namespace=namespace, output="screen")
         for name in ("mesher", "analysis")
     ]
-    # The recorder first: it misses less.
-    return LaunchDescription([*arguments, recorder, *others, OpaqueFunction(function=simulators)])
+    # The simulators first: an error there comes before anything runs.
+    return LaunchDescription([*arguments, OpaqueFunction(function=simulators), recorder, *others])
