@@ -6,14 +6,17 @@ the stance femur passes the vertical (eq. 22), by ``v = -k |sigma|^(2 alpha - 1)
 
 The law near sigma = 0
 ----------------------
-There the exponent below one makes the law infinitely steep. An output in sliding mode rests where
-``v = -dh / tau``, on the slow manifold ``sigma_s = sign(dh) (|dh| / (tau k))^(1 / (2 alpha - 1))``,
-which tends to sigma = 0 as the output comes to rest, and is drawn to it ever faster. No explicit
-integrator can follow that, nor is it of interest how fast it happens. So the secant slope of the
-law about the slow manifold is bounded by `SLIDING_RATE`: further off than that, the law is
-eq. (21) to the letter; closer, the output comes to the same manifold within ``1 / SLIDING_RATE``,
-later by less than a step of the integrator. Where 2 alpha - 1 <= 0, outside of what the paper
-allows but present in its Table 3, sigma = 0 itself is the sliding manifold (Filippov).
+There the exponent below one makes the law infinitely steep, and no explicit integrator can follow
+it, nor is it of interest how fast an output settles that settles at once. So its slope is bounded
+twice, far above the rates of the gait (some 20/s):
+
+- By `STEEPEST` about sigma = 0: below ``(k / STEEPEST)^(1 / (2 - 2 alpha))``, some 1e-5 rad/s, the
+  law is linear. That moves an output by less than 1e-6 rad. It also covers 2 alpha - 1 <= 0, outside
+  of what the paper allows but present in its Table 3, where the law jumps at sigma = 0: the output
+  then slides there (Filippov), without the chatter that a literal sign function would leave.
+- By `SLIDING_RATE` about the slow manifold, where an output in sliding mode rests with
+  ``v = -dh / tau``: further off than ``|v + dh / tau| / SLIDING_RATE`` the law is eq. (21) to the
+  letter, closer the output comes to the same manifold within ``1 / SLIDING_RATE``.
 """
 
 from __future__ import annotations
@@ -53,26 +56,26 @@ PARAMETERS = (
 SLIDING_RATE = 2000.0
 """1/s, the steepest secant of the law about its slow manifold."""
 
+STEEPEST = 5e4
+"""1/s, the steepest secant of the law about sigma = 0."""
+
 # Offsets into the packed parameters: references before and after the switch, then k, 2 alpha - 1,
-# 1 / tau, and the half width about sigma = 0 of a law without a slow manifold.
-_REF1, _REF2, _K, _EXPONENT, _RATE = 0, 4, 8, 12, 16
-PACKED_SIZE = 20
-_TINY = 1e-9
+# 1 / tau, and the half width about sigma = 0 where the law is linear.
+_REF1, _REF2, _K, _EXPONENT, _RATE, _WIDTH = 0, 4, 8, 12, 16, 20
+PACKED_SIZE = 24
 
 
 @kernel
-def _law(sigma, rate, k, exponent):
-    """-v of eq. (21) for one output; ``rate`` is dh / tau."""
+def _law(sigma, rate, k, exponent, width):
+    """-v of eq. (21) for one output; ``rate`` is dh / tau, ``width`` where the law is linear."""
     size = abs(sigma)
-    if exponent > 0.0:
-        law = math.copysign(k * size**exponent, sigma)
+    law = sigma * STEEPEST if size < width else math.copysign(k * size**exponent, sigma)
+    if abs(rate) <= STEEPEST * width:
+        slow = rate / STEEPEST
+    elif exponent > 0.0:
         slow = math.copysign((abs(rate) / k) ** (1.0 / exponent), rate)
     else:
-        law = math.copysign(k * max(size, _TINY) ** exponent, sigma)
-        slow = 0.0
-        if abs(rate) >= k * max(size, _TINY) ** exponent:
-            # Too fast to slide: the law is discontinuous, and only crossed.
-            return law * min(1.0, size / _TINY)
+        return law  # too fast to slide: sigma = 0 is only crossed
     excess = law - rate
     bound = SLIDING_RATE * abs(sigma - slow)
     if abs(excess) > bound:
@@ -96,7 +99,9 @@ def command(par, work, y, after_switch):
         error = value - par[ref + i]
         inverse_tau = par[_RATE + i]
         sigma = rate + error * inverse_tau
-        v = -_law(sigma, rate * inverse_tau, par[_K + i], par[_EXPONENT + i])
+        v = -_law(
+            sigma, rate * inverse_tau, par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
+        )
         if i == 0:
             work[ALPHA, 1] = v
             work[ALPHA, 3] = v
@@ -180,6 +185,13 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     out[_REF1 : _REF1 + 4] = ref1, q3, q4_1, torso
     out[_REF2 : _REF2 + 4] = ref2, q3, q4_2, torso
     out[_K : _K + 4] = parameters[6:10]
-    out[_EXPONENT : _EXPONENT + 4] = 2.0 * parameters[10:14] - 1.0
+    exponent = 2.0 * parameters[10:14] - 1.0
+    out[_EXPONENT : _EXPONENT + 4] = exponent
+    # Where k w^exponent = STEEPEST w; a plain PD law (exponent 1) needs no such range.
+    out[_WIDTH : _WIDTH + 4] = 0.0
+    bent = exponent < 1.0
+    out[_WIDTH : _WIDTH + 4][bent] = (parameters[6:10] / STEEPEST)[bent] ** (
+        1.0 / (1.0 - exponent[bent])
+    )
     out[_RATE : _RATE + 4] = 1.0 / parameters[14:18]
     return out

@@ -14,7 +14,8 @@ from biped_mfpt_ros.walker.dynamics import ACC, TORQUE
 def closed_loop(scheme, switched, rob, par, work, y, rate):
     """Time derivative of angles, rates and energy under a controller (eq. 2, 8, 16).
 
-    Torques beyond the limit are cut off, joint by joint.
+    Torques beyond the limit are cut off, joint by joint; which ones are stands in
+    ``work[TORQUE, 4]``, as a number that is zero for none.
 
     Returns
     -------
@@ -22,6 +23,7 @@ def closed_loop(scheme, switched, rob, par, work, y, rate):
         Force of the ground on the stance foot: tangential, normal, N.
     """
     dynamics.set_angles(work, y)
+    work[TORQUE, 4] = 0.0
     if scheme == HZD and switched:
         for i in range(4):
             work[TORQUE, i] = 0.0
@@ -41,7 +43,10 @@ def closed_loop(scheme, switched, rob, par, work, y, rate):
         for i in range(4):
             if not abs(work[TORQUE, i]) <= limit:
                 saturated = True
+                work[TORQUE, 4] = 3.0 * work[TORQUE, 4] + (1.0 if work[TORQUE, i] > 0.0 else 2.0)
                 work[TORQUE, i] = min(limit, max(-limit, work[TORQUE, i]))
+            else:
+                work[TORQUE, 4] *= 3.0
         if saturated:
             u0, u1, u2, u3 = work[TORQUE, 0], work[TORQUE, 1], work[TORQUE, 2], work[TORQUE, 3]
             dynamics.free_motion(rob, work, y)

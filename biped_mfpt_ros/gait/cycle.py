@@ -113,8 +113,10 @@ def find_limit_cycle(
     else:
         states = check_states(np.atleast_2d(np.asarray(guess, dtype=np.float64)), "guess")
     falls: np.ndarray = np.empty(0, dtype=np.uint8)
+    behind = slope if guess is not None else 0.0  # the starts come from flat ground
     for walked in range(_WALK_STEPS):
-        steps = simulate_steps(controller, states, np.full(len(states), slope), [slope], model)
+        steps = simulate_steps(controller, states, np.full(len(states), behind), [slope], model)
+        behind = slope
         upright = steps.outcomes[:, 0] == Outcome.STEP
         falls = steps.outcomes[~upright, 0] if (~upright).any() else falls
         if not upright.any():

