@@ -1,0 +1,85 @@
+"""The command line, `biped-mfpt`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from biped_mfpt_ros.cli.parser import make_parser
+from biped_mfpt_ros.errors import InputError
+
+_OWN = __name__.partition(".")[0] + "."
+
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_STOPPED = 1, 2, 130
+
+
+class CommandError(Exception):
+    """A command could not do what it was asked to; the message says why."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Without the program's name; those of this process by default.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 1 could not be done, 2 bad input, 130 stopped by SIGINT or SIGTERM.
+    """
+    try:
+        args = make_parser().parse_args(arguments)
+    except SystemExit as end:  # --help, --version, or bad input that has been reported
+        return int(end.code or 0)
+    try:
+        return _run(args)
+    except BrokenPipeError:
+        # The reader of stdout is gone, as with `| head`. Python would notice it again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        return EXIT_STOPPED
+
+
+def _run(args: argparse.Namespace) -> int:
+    """Import the function of a command and call it; report the errors that are meant for users."""
+    module, name = args.function.split(":")
+    try:
+        code = getattr(importlib.import_module(module), name)(args)
+        sys.stdout.flush()
+        return code or 0
+    except BrokenPipeError:
+        raise
+    except InputError as error:
+        field = option_of(error.field, vars(args))
+        problem = InputError(field, error.value, error.allowed)
+        print(f"{args.parser.prog}: error: {problem}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except Exception as error:
+        # Errors of our own classes, and those of files, say what is wrong. Any other is a bug.
+        if not isinstance(error, OSError) and not type(error).__module__.startswith(_OWN):
+            raise
+        print(f"{args.parser.prog}: {error}", file=sys.stderr)
+        return EXIT_FAILED
+
+
+# Fields of the core that are not called as the options that set them.
+_OPTIONS = {
+    "states": "--state",
+    "slope_step_deg": "--slope-step",
+    "slope_limit_deg": "--slope-limit",
+}
+
+
+def option_of(field: str, options: dict[str, object]) -> str:
+    """Name of the option that sets a field, or the field itself if there is none."""
+    base = field.partition("[")[0]
+    if base in _OPTIONS:
+        return _OPTIONS[base]
+    return "--" + base.replace("_", "-") if base in options else field

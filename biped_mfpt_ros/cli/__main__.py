@@ -1,0 +1,7 @@
+"""``python -m biped_mfpt_ros.cli``."""
+
+import sys
+
+from biped_mfpt_ros.cli import main
+
+sys.exit(main())

@@ -1,0 +1,165 @@
+"""What `biped-mfpt run` asks of the nodes: grow a mesh, tell its MFPT."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from biped_mfpt_msgs.action import GrowMesh
+from biped_mfpt_msgs.msg import MeshProgress as MeshProgressMsg
+from biped_mfpt_msgs.msg import MfptEstimate
+from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from biped_mfpt_ros.cli import CommandError
+from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
+from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
+
+_POLL = 0.05  # s
+
+
+@dataclass(frozen=True)
+class Peers:
+    """Which nodes of the pipeline are there."""
+
+    simulators: int
+    mesher: bool
+    analysis: bool
+    recorder: bool
+
+
+class Client:
+    """Client of a pipeline in one namespace. Use it as a context manager.
+
+    Parameters
+    ----------
+    namespace : str
+        Of the nodes, with a leading slash.
+    watch : callable
+        Called some twenty times a second while the client waits; it may raise to end that.
+    """
+
+    def __init__(self, namespace: str, watch: Callable[[], object]) -> None:
+        self._watch = watch
+        self._context = Context()
+        # Signals belong to the processes' supervisor, and the log to the terminal.
+        rclpy.init(
+            args=["--ros-args", "--disable-external-lib-logs", "--log-level", "error"],
+            context=self._context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._node = Node("run", namespace=namespace, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._grow = ActionClient(self._node, GrowMesh, "grow_mesh")
+        self._compute = self._node.create_client(ComputeMfpt, "compute_mfpt", qos_profile=REQUESTS)
+        self._estimates: list[MfptEstimate] = []
+        self._node.create_subscription(MfptEstimate, "mfpt", self._estimates.append, RESULTS)
+
+    def __enter__(self) -> Client:
+        """Start."""
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """Leave the graph."""
+        self._executor.shutdown(timeout_sec=0.0)
+        self._grow.destroy()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def peers(self) -> Peers:
+        """Look who is there."""
+        services = self._node.get_service_names_and_types()
+        kind = f"{SimulateSteps.__module__.split('.')[0]}/srv/{SimulateSteps.__name__}"
+        here = self._node.get_namespace().rstrip("/") + "/"
+        simulators = [name for name, types in services if kind in types and name.startswith(here)]
+        recorders = self._node.get_subscriptions_info_by_topic(
+            self._node.resolve_topic_name("mesh/info")
+        )
+        return Peers(
+            simulators=len(simulators),
+            mesher=self._grow.server_is_ready(),
+            analysis=self._compute.service_is_ready(),
+            recorder=any(info.node_name == "recorder" for info in recorders),
+        )
+
+    def wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
+        """Wait until a condition holds; CommandError after ``timeout`` seconds."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                raise CommandError(f"waited {timeout:g} s for {what}")
+            self._spin()
+
+    def grow_mesh(
+        self, settings: MeshSettings, feedback: Callable[[MeshProgressMsg], object]
+    ) -> GrowMesh.Result:
+        """Have the mesher grow a mesh.
+
+        Parameters
+        ----------
+        settings : MeshSettings
+            Of the mesh.
+        feedback : callable
+            Told how far it has come.
+
+        Raises
+        ------
+        CommandError
+            If the mesher refuses, or the mesh fails.
+        """
+        goal = GrowMesh.Goal(settings=settings_message(settings))
+        handle = self._result(
+            self._grow.send_goal_async(
+                goal, feedback_callback=lambda message: feedback(message.feedback.progress)
+            )
+        )
+        if not handle.accepted:
+            raise CommandError("the mesher refused the mesh; its log says why")
+        result: GrowMesh.Result = self._result(handle.get_result_async()).result
+        if not result.success:
+            raise CommandError(f"the mesh failed: {result.message}")
+        return result
+
+    def published_mfpt(
+        self, mesh_id: str, mu_s: float, sigma_s: Sequence[float], timeout: float
+    ) -> list[MfptEstimate]:
+        """The MFPT of a mesh as the analysis publishes it, one for each ``sigma_s``."""
+
+        def found() -> list[MfptEstimate]:
+            mine = {
+                estimate.sigma_s: estimate
+                for estimate in self._estimates
+                if estimate.mesh_id == mesh_id and estimate.mu_s == mu_s
+            }
+            return [mine[sigma] for sigma in sigma_s if sigma in mine]
+
+        self.wait(lambda: len(found()) == len(sigma_s), timeout, "the analysis to publish the MFPT")
+        return found()
+
+    def compute_mfpt(
+        self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]
+    ) -> list[MfptEstimate]:
+        """Ask the analysis for the MFPT of a mesh at any ``sigma_s``."""
+        request = ComputeMfpt.Request(mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(sigma_s, "d"))
+        response = self._result(self._compute.call_async(request))
+        if not response.success:
+            raise CommandError(f"the analysis failed: {response.message}")
+        return list(response.estimates)
+
+    def _result(self, future: Future) -> Any:
+        while not future.done():
+            self._spin()
+        return future.result()
+
+    def _spin(self) -> None:
+        self._executor.spin_once(timeout_sec=_POLL)
+        self._watch()

@@ -1,0 +1,46 @@
+"""`biped-mfpt compile`: the numeric kernels, before anything has to wait for them."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from biped_mfpt_ros.chain.mesh import grow_mesh
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.gait.monte_carlo import monte_carlo
+from biped_mfpt_ros.gait.step import simulate_steps
+from biped_mfpt_ros.gait.trace import trace_swing
+from biped_mfpt_ros.nodes.warm_up import compiled
+from biped_mfpt_ros.report.progress import Progress, duration_text
+from biped_mfpt_ros.walker.robot import rabbit
+
+
+def compile_kernels(args: argparse.Namespace) -> None:
+    """Compile every kernel."""
+    start = time.perf_counter()
+    with Progress(quiet=args.quiet) as progress:
+        compile_all(progress.say)
+    seconds = time.perf_counter() - start
+    if args.json:
+        print(json_text({"seconds": seconds}))
+    else:
+        print(f"all kernels are compiled, {duration_text(seconds)}")
+
+
+def compile_all(say: Callable[[str], object]) -> None:
+    """Run every kernel on something small; ``say`` is told when one has to be compiled."""
+    walking, slopes = controller("hzd/base"), np.radians([-1.0, 0.0, 1.0])
+    state = walking.reference_state(1.7, rabbit())
+    with compiled(say, "the numeric kernels"):
+        monte_carlo(walking, 0.1, 1, 0, state=state, threads=1)
+        trace_swing(walking, state, 0.0, 0.0)
+        grow_mesh(
+            lambda states, previous: simulate_steps(walking, states, previous, slopes),
+            state,
+            slopes,
+            1.0,
+        )

@@ -1,0 +1,105 @@
+"""Commands that mesh a controller in this process, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from biped_mfpt_ros.chain.markov import metastability
+from biped_mfpt_ros.chain.mesh import Mesh, grow_mesh
+from biped_mfpt_ros.cli import options
+from biped_mfpt_ros.cli.growth import Growth
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.cli.results import estimate_row, mfpt_table
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.report.progress import Progress, duration_text
+
+_MESH_ARRAYS = (
+    "slopes", "states", "preceding", "generation", "targets", "outcomes", "scales",
+)  # fmt: skip
+
+
+def mesh(args: argparse.Namespace) -> None:
+    """Mesh a controller's reachable states."""
+    if args.output is not None and Path(args.output).exists():
+        raise InputError("--output", args.output, "a file that does not exist yet")
+    grown, result = _grow(args)
+    if args.output is not None:
+        # Under the name that was given: numpy would add an ending to a name.
+        with open(args.output, "xb") as file:
+            np.savez_compressed(
+                file,
+                **{name: getattr(grown, name) for name in _MESH_ARRAYS},
+                threshold=grown.threshold,
+                clustered=grown.clustered,
+            )
+        result["output"] = args.output
+    if args.json:
+        print(json_text(result))
+        return
+    print(_mesh_text(result))
+    if args.output is not None:
+        print(f"written to {args.output}")
+
+
+def mfpt(args: argparse.Namespace) -> None:
+    """Mesh a controller and compute its MFPT."""
+    mean = options.slope("--mean", args.mean)
+    sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
+    grown, result = _grow(args)
+    start = time.perf_counter()
+    estimates = []
+    for sigma, sigma_deg in zip(sigmas, args.sigma, strict=True):
+        found = metastability(grown, mean, sigma)
+        estimates.append(
+            estimate_row(args.controller, args.mean, sigma_deg, found, found.failure_shares)
+        )
+    result |= {
+        "mean_slope": mean,
+        "estimates": estimates,
+        "chain_seconds": time.perf_counter() - start,
+    }
+    if args.json:
+        print(json_text(result))
+        return
+    print(_mesh_text(result))
+    print()
+    print(mfpt_table(estimates))
+
+
+def _grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:
+    """Grow the mesh that the options ask for; also what describes it, for JSON."""
+    controller, model = options.controller_of(args), options.model_of(args)
+    slopes = options.slopes_of(args)
+    settings = options.mesh_settings(args)
+    with Progress(quiet=args.quiet) as progress, Growth(controller, slopes, model, progress) as by:
+        initial = find_limit_cycle(controller, 0.0, model).state
+        start = time.perf_counter()
+        grown = grow_mesh(
+            by.simulate, initial, slopes, args.threshold, on_generation=by.on_generation, **settings
+        )
+        seconds = time.perf_counter() - start
+    return grown, options.described(controller, model) | {
+        "slope_step_deg": args.slope_step,
+        "slope_limit_deg": args.slope_limit,
+        "slopes": len(slopes),
+        "threshold": grown.threshold,
+        "clustered": grown.clustered,
+        "states": len(grown.states),
+        "generations": int(grown.generation.max()) + 1,
+        "swings": by.swings,
+        "seconds": seconds,
+        "step_map_seconds": by.seconds,
+    }
+
+
+def _mesh_text(result: dict[str, Any]) -> str:
+    return (
+        f"{result['controller']}: {result['states']} states in {result['generations']} "
+        f"generations, {result['slopes']} slopes, {duration_text(result['seconds'])}"
+    )

@@ -1,0 +1,63 @@
+"""From options to the objects of the core. Degrees end here."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import Any
+
+import numpy as np
+
+from biped_mfpt_ros.control.controller import Controller, controller
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.walker.robot import WalkerModel
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG, slope_set
+
+_MODEL_OPTIONS = ("torque_limit", "friction", "slip_duration", "time_limit", "tolerance")
+
+
+def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the named options that were given; defaults of the others live in the core."""
+    return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+
+
+def controller_of(args: argparse.Namespace) -> Controller:
+    """The controller that was asked for."""
+    return controller(args.controller)
+
+
+def model_of(args: argparse.Namespace) -> WalkerModel:
+    """The walker's model."""
+    return WalkerModel(**given(args, *_MODEL_OPTIONS))
+
+
+def slopes_of(args: argparse.Namespace) -> np.ndarray:
+    """The slope set, rad."""
+    return slope_set(args.slope_step, args.slope_limit)
+
+
+def mesh_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """What `grow_mesh` takes beside slopes and threshold."""
+    return given(args, "max_states") | {"clustered": not args.unclustered}
+
+
+def slope(option: str, degrees: float) -> float:
+    """A slope in rad; raises InputError in the degrees that were typed."""
+    if not abs(degrees) <= SLOPE_LIMIT_DEG:
+        raise InputError(option, degrees, f"-{SLOPE_LIMIT_DEG:g} to {SLOPE_LIMIT_DEG:g} degrees")
+    return math.radians(degrees)
+
+
+def spread(option: str, degrees: float) -> float:
+    """A standard deviation of the slope in rad; raises InputError in the degrees typed."""
+    if not 0.0 < degrees < math.inf:
+        raise InputError(option, degrees, "a finite number of degrees > 0")
+    return math.radians(degrees)
+
+
+def described(controller: Controller, model: WalkerModel) -> dict[str, Any]:
+    """What walked, for JSON."""
+    return {
+        "controller": controller.name,
+        "model": {name: getattr(model, name) for name in _MODEL_OPTIONS},
+    }

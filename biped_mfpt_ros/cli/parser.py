@@ -1,0 +1,457 @@
+"""What `biped-mfpt` accepts. Imports nothing but argparse: `--help` has to be quick.
+
+Each subcommand names the function that does it as ``"module:function"``, which `main` imports when
+it is wanted. Options that several commands share are in parent parsers, written once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from biped_mfpt_ros import __version__
+
+CLI = "biped_mfpt_ros.cli"
+NODES = ("simulator", "mesher", "analysis", "recorder")
+
+DEFAULT_CONTROLLER = "hzd/mfpt"
+
+_DESCRIPTION = """\
+How many steps does a walking robot take on rough ground before it falls?
+
+biped-mfpt walks the five-link biped RABBIT on slopes drawn from a normal distribution, meshes the
+states that it can reach, makes a Markov chain of them and computes the mean first-passage time
+(MFPT) to a fall, in steps.
+"""
+
+_EPILOG = """\
+examples:
+  biped-mfpt run                                  the pipeline over ROS 2, recorded, with a picture
+  biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --slope-step 0.5 --threshold 0.3
+  biped-mfpt monte-carlo --controller hzd/cot --sigma 2 --walks 10000 --seed 1
+  biped-mfpt cycle --controller hzd/base --json   one JSON object on stdout, for scripts
+
+units:
+  On the command line slopes and their spread are in degrees (negative is downhill), states in rad
+  and rad/s, everything else in SI units. JSON is in SI units and radians throughout; the few keys
+  that are in degrees end in _deg. An infinite value is the string "inf", an undefined one null.
+
+exit codes:
+  0  done    1  could not be done (no limit cycle, a node died, ...)    2  bad input    130  stopped
+
+`biped-mfpt COMMAND --help` tells more.
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser with one-line errors, that takes values such as ``-3.1,0.2`` as values."""
+
+    def __init__(self, **settings: Any) -> None:
+        settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(allow_abbrev=False, **settings)
+        # Python before 3.14 takes only plain negative numbers for values, not -1e-3 or -1,2.
+        self._negative_number_matcher = re.compile(r"-(\.?\d|inf|nan)")
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with code 2."""
+        message = re.sub(r"^argument (\S+?)(/\S+)?: ", r"\1: ", message)
+        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def _value(convert: Callable[[str], Any], allowed: str) -> Callable[[str], Any]:
+    """Type of an option whose text is converted, with a message that says what is allowed."""
+
+    def parse(text: str) -> Any:
+        try:
+            return convert(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not allowed; allowed: {allowed}"
+            ) from None
+
+    return parse
+
+
+def _limit(text: str) -> float:
+    return float("inf") if text == "none" else float(text)
+
+
+def _state(text: str) -> list[float]:
+    values = [float(part) for part in text.split(",")]
+    if len(values) != 10:
+        raise ValueError
+    return values
+
+
+_number = _value(float, "a number")
+_whole = _value(int, "a whole number")
+
+
+def _parents() -> dict[str, Parser]:
+    """The options that several commands share, by group."""
+    groups = {}
+
+    def group(name: str, title: str) -> argparse._ArgumentGroup:
+        groups[name] = Parser(add_help=False)
+        return groups[name].add_argument_group(title)
+
+    output = group("output", "output")
+    output.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    output.add_argument("--quiet", action="store_true", help="show no progress on stderr")
+
+    # Defaults of the model, and of all that the core checks itself, live in the core: an option
+    # that is not given is None here and is not passed on.
+    walker = group("walker", "walker")
+    walker.add_argument(
+        "--controller",
+        default=DEFAULT_CONTROLLER,
+        metavar="NAME",
+        help="what walks, see `biped-mfpt controllers` (default: %(default)s)",
+    )
+    walker.add_argument(
+        "--torque-limit",
+        type=_value(_limit, "a number (N m) or none"),
+        metavar="NM",
+        help="N m on every joint, or none (default: 50)",
+    )
+    walker.add_argument(
+        "--friction",
+        type=_value(_limit, "a number or none"),
+        metavar="MU",
+        help="coefficient between foot and ground, or none for no slip (default: 0.6)",
+    )
+    walker.add_argument(
+        "--slip-duration",
+        type=_number,
+        metavar="S",
+        help="s, how long the stance foot must slip before it counts as a fall (default: 0)",
+    )
+    walker.add_argument(
+        "--time-limit",
+        type=_number,
+        metavar="S",
+        help="s, a swing that lasts longer is a fall (default: 3)",
+    )
+    walker.add_argument(
+        "--tolerance",
+        type=_number,
+        metavar="TOL",
+        help="local error of the integrator, rad and rad/s (default: 3e-9)",
+    )
+
+    terrain = group("terrain", "terrain")
+    terrain.add_argument(
+        "--mean",
+        type=_number,
+        default=0.0,
+        metavar="DEG",
+        help="degrees, mean slope (default: 0)",
+    )
+
+    mesh = group("mesh", "mesh")
+    mesh.add_argument(
+        "--slope-step",
+        type=_number,
+        default=0.5,
+        metavar="DEG",
+        help="degrees between the slopes of the set, d_s of the paper (default: 0.5)",
+    )
+    mesh.add_argument(
+        "--slope-limit",
+        type=_number,
+        default=20.0,
+        metavar="DEG",
+        help="degrees, steepest slope of the set (default: 20)",
+    )
+    mesh.add_argument(
+        "--threshold",
+        type=_number,
+        default=0.3,
+        metavar="D",
+        help="standardized squared distance from which on a state is a new one, d_thr of the "
+        "paper (default: 0.3)",
+    )
+    mesh.add_argument(
+        "--unclustered",
+        action="store_true",
+        help="look for the nearest state among all, not only among those after the same slope",
+    )
+    mesh.add_argument(
+        "--max-states",
+        type=_whole,
+        metavar="N",
+        help="give up when the mesh grows beyond N states (default: 100000)",
+    )
+    return groups
+
+
+def make_parser() -> Parser:
+    """The parser of `biped-mfpt` with all its subcommands."""
+    parser = Parser(prog="biped-mfpt", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("--version", action="version", version=f"biped-mfpt {__version__}")
+    commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", dest="command", required=True, parser_class=Parser
+    )
+    parents = _parents()
+
+    def add(name: str, function: str, summary: str, details: str, *groups: str) -> Parser:
+        description, _, examples = details.strip().partition("\nexamples:\n")
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary[0].upper()}{summary[1:]}.\n\n{description}",
+            epilog=f"examples:\n{examples}" if examples else None,
+            parents=[parents[group] for group in groups],
+        )
+        command.set_defaults(function=f"{CLI}.{function}", parser=command)
+        return command
+
+    run = add(
+        "run",
+        "pipeline:run",
+        "run the whole pipeline over ROS 2 and compare the result with the paper",
+        """
+Starts simulators, mesher, analysis and recorder as processes of their own, grows the mesh of a
+controller with all simulators, has the analysis compute the MFPT, and ends all processes again.
+A directory keeps the bag with everything that was published, the logs, a picture and the result.
+
+Each run has a ROS namespace of its own, so runs side by side do not mix. Simulators of other
+machines join a run when they are started in its namespace:
+  ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET biped-mfpt run --namespace rough
+  ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET biped-mfpt node simulator --ros-args -r __ns:=/rough
+
+examples:
+  biped-mfpt run
+  biped-mfpt run --controller hzd/base --threshold 0.1 --sigma 1 2
+  biped-mfpt run --workers 8 --output runs/fine --threshold 0.03 --walks 0
+""",
+        "walker",
+        "mesh",
+        "terrain",
+        "output",
+    )
+    run.add_argument(
+        "--sigma",
+        type=_number,
+        nargs="+",
+        default=[1.0, 2.0],
+        metavar="DEG",
+        help="degrees, standard deviations of the slope (default: 1 2)",
+    )
+    run.add_argument(
+        "--walks",
+        type=_whole,
+        default=2000,
+        metavar="N",
+        help="Monte Carlo walks for each sigma at which the robot falls soon; 0: none "
+        "(default: %(default)s)",
+    )
+    run.add_argument(
+        "--seed", type=_whole, default=1, metavar="N", help="of the walks (default: 1)"
+    )
+    run.add_argument(
+        "--workers",
+        type=_whole,
+        metavar="N",
+        help="simulator processes to start here (default: one for each core)",
+    )
+    run.add_argument(
+        "--namespace", metavar="NAME", help="ROS namespace of the nodes (default: unique)"
+    )
+    run.add_argument(
+        "--output",
+        metavar="DIR",
+        help="new directory for bag, picture and logs (default: runs/TIME-CONTROLLER)",
+    )
+
+    mfpt = add(
+        "mfpt",
+        "meshes:mfpt",
+        "mesh a controller and compute its mean first-passage time to a fall",
+        """
+The mesh does not depend on the distribution of the slopes, so that any number of standard
+deviations costs one mesh. In this process, without ROS.
+
+examples:
+  biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --slope-step 0.5 --threshold 0.3
+  biped-mfpt mfpt --controller hzd/cot --sigma 0.5 1 1.5 2 --mean -1 --json
+""",
+        "walker",
+        "mesh",
+        "terrain",
+        "output",
+    )
+    mfpt.add_argument(
+        "--sigma",
+        type=_number,
+        nargs="+",
+        required=True,
+        metavar="DEG",
+        help="degrees, standard deviations of the slope",
+    )
+
+    mesh = add(
+        "mesh",
+        "meshes:mesh",
+        "mesh the states that a controller can reach",
+        """
+Algorithm 1 of the paper, in this process, without ROS. With --output the mesh is written to a
+file of numpy arrays (.npz): slopes, states, preceding, generation, targets, outcomes, scales.
+
+examples:
+  biped-mfpt mesh --controller hzd/base --threshold 0.1
+  biped-mfpt mesh --controller hzd/cot --slope-step 1 --output cot.npz --json
+""",
+        "walker",
+        "mesh",
+        "output",
+    )
+    mesh.add_argument("--output", metavar="FILE", help="write the mesh to this new .npz file")
+
+    monte_carlo = add(
+        "monte-carlo",
+        "single:monte_carlo",
+        "walk on random slopes until the fall, many times",
+        """
+As for Table 2 of the paper: the first step is dropped, walks that fell in it are not counted.
+Each walk has a random generator of its own: the result depends on the seed alone, not on the
+number of cores. Slopes beyond 45 degrees are cut to that.
+
+examples:
+  biped-mfpt monte-carlo --controller hzd/cot --sigma 2 --walks 10000 --seed 1
+  biped-mfpt monte-carlo --controller hzd/base --sigma 2 --torque-limit none --json
+""",
+        "walker",
+        "terrain",
+        "output",
+    )
+    monte_carlo.add_argument(
+        "--sigma",
+        type=_number,
+        required=True,
+        metavar="DEG",
+        help="degrees, standard deviation of the slope",
+    )
+    monte_carlo.add_argument(
+        "--walks", type=_whole, default=10_000, metavar="N", help="(default: %(default)s)"
+    )
+    monte_carlo.add_argument(
+        "--seed", type=_whole, default=1, metavar="N", help="of all walks (default: %(default)s)"
+    )
+    monte_carlo.add_argument(
+        "--max-steps",
+        type=_whole,
+        default=10_000,
+        metavar="N",
+        help="stop a walk that has not fallen after N steps (default: %(default)s)",
+    )
+
+    cycle = add(
+        "cycle",
+        "single:cycle",
+        "find a controller's limit cycle, its speed, cost of transport and eigenvalues",
+        """
+Newton's method on the step map; the eigenvalues are those of its Jacobian at the cycle.
+
+examples:
+  biped-mfpt cycle --controller hzd/base
+  biped-mfpt cycle --controller smc/mfpt --slope -1 --json
+""",
+        "walker",
+        "output",
+    )
+    cycle.add_argument(
+        "--slope",
+        type=_number,
+        default=0.0,
+        metavar="DEG",
+        help="degrees, constant slope, negative is downhill (default: 0)",
+    )
+
+    step = add(
+        "step",
+        "single:step",
+        "simulate one step from a state",
+        """
+A state is q1,..,q5,dq1,..,dq5 just after impact, in rad and rad/s: stance femur, swing femur
+(relative to the torso), stance tibia, swing tibia (relative to their femurs), torso (absolute);
+counter-clockwise is positive and the robot walks towards +x. `biped-mfpt cycle` prints one.
+
+examples:
+  biped-mfpt step --controller hzd/base --previous-slope 0 --slope -2 \\
+      --state 3.6351,3.0548,-0.4360,-0.3399,-0.0161,-0.57,0.32,-0.91,0.45,0.26
+""",
+        "walker",
+        "output",
+    )
+    step.add_argument(
+        "--state",
+        type=_value(_state, "ten numbers q1,..,q5,dq1,..,dq5 in rad and rad/s"),
+        required=True,
+        metavar="Q1,..,DQ5",
+        help="rad and rad/s, just after impact",
+    )
+    step.add_argument(
+        "--previous-slope",
+        type=_number,
+        default=0.0,
+        metavar="DEG",
+        help="degrees, ground behind the stance foot (default: 0)",
+    )
+    step.add_argument(
+        "--slope",
+        type=_number,
+        default=0.0,
+        metavar="DEG",
+        help="degrees, ground ahead, negative is downhill (default: 0)",
+    )
+
+    inspect = add(
+        "inspect",
+        "bags:inspect",
+        "read a recorded bag, rebuild its meshes and compute their MFPT again",
+        """
+The bag alone holds all that is needed: nothing is simulated, and the numbers equal those of the
+run bit for bit.
+
+examples:
+  biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag
+""",
+        "output",
+    )
+    inspect.add_argument("bag", metavar="BAG", help="directory of a bag, or its .mcap file")
+
+    add(
+        "controllers",
+        "single:controllers",
+        "list the controllers of the paper with its figures",
+        "",
+        "output",
+    )
+
+    node = commands.add_parser(
+        "node",
+        help="start one node of the pipeline",
+        description="Start one node of the pipeline, like `ros2 run biped_mfpt_ros NAME`, where "
+        "there is no ros2\ncommand. All that follows NAME goes to the node.",
+        epilog="examples:\n"
+        "  biped-mfpt node simulator\n"
+        "  biped-mfpt node mesher --ros-args -r __ns:=/rough --log-level debug",
+    )
+    node.set_defaults(function=f"{CLI}.node:node", parser=node)
+    node.add_argument(
+        "--end-with", type=int, metavar="PID", help=argparse.SUPPRESS
+    )  # of a parent that may be killed
+    node.add_argument("name", choices=NODES, metavar="NAME", help=", ".join(NODES))
+    node.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+
+    add(
+        "compile",
+        "kernels:compile_kernels",
+        "compile the numeric kernels, so that nothing has to wait for that later",
+        "Done once for a version of the sources; after that it takes a second and changes nothing.",
+        "output",
+    )
+    return parser

@@ -1,0 +1,320 @@
+"""`biped-mfpt run`: the whole pipeline over ROS 2, and its result beside the paper's."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from biped_mfpt_ros.cli import CommandError, options
+from biped_mfpt_ros.cli.kernels import compile_all
+from biped_mfpt_ros.cli.node import require_ros
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.cli.processes import Processes
+from biped_mfpt_ros.cli.results import estimate_row, mfpt_table, monte_carlo_result
+from biped_mfpt_ros.control.controller import Controller
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.gait.monte_carlo import monte_carlo
+from biped_mfpt_ros.report import paper
+from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
+from biped_mfpt_ros.report.tables import difference, number, table
+from biped_mfpt_ros.walker.outcome import Outcome
+from biped_mfpt_ros.walker.robot import WalkerModel
+
+_START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
+_RESULT_TIMEOUT = 120.0  # s, for the analysis to solve the chain
+_MOST_SWINGS = 100_000  # of a Monte Carlo: half a minute or so
+_CURVE_POINTS = 40
+_PICTURE_STEPS = 6
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the pipeline, compare with the paper, keep everything in a directory."""
+    # All that may be wrong is found before anything is started or written.
+    controller, model = options.controller_of(args), options.model_of(args)
+    slopes = options.slopes_of(args)
+    mean = options.slope("--mean", args.mean)
+    sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
+    workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
+    for option, value, least in (
+        ("--workers", workers, 1),
+        ("--walks", args.walks, 0),
+        ("--seed", args.seed, 0),
+    ):
+        if value < least:
+            raise InputError(option, value, f"a whole number >= {least}")
+    name = f"{time.strftime('%Y%m%d-%H%M%S')}-{controller.name.replace('/', '-')}"
+    namespace = _namespace(args.namespace or f"run_{name}_{os.getpid()}")
+    require_ros()
+    from biped_mfpt_ros.nodes.messages import MeshSettings
+    from biped_mfpt_ros.nodes.spin import prepare_environment
+
+    settings = MeshSettings(
+        controller, model, slopes, args.threshold, **options.mesh_settings(args)
+    )
+    prepare_environment()
+    directory = _new_directory(args.output, name)
+
+    with Progress(quiet=args.quiet) as progress:
+        compile_all(progress.say)
+        result: dict[str, Any] = options.described(controller, model) | {
+            "namespace": namespace,
+            "workers": workers,
+            "slope_step_deg": args.slope_step,
+            "slope_limit_deg": args.slope_limit,
+            "slopes": len(slopes),
+            "mean_slope": mean,
+        }
+        progress.say(f"running in {directory}, ROS namespace {namespace}")
+        with Processes(directory / "logs") as processes:
+            pipeline = _Pipeline(processes, progress, namespace, directory)
+            pipeline.start(workers, mean, sigmas)
+            result |= pipeline.mesh(settings, mean, dict(zip(sigmas, args.sigma, strict=True)))
+        result["monte_carlo"] = _walks(controller, model, mean, args, result["estimates"], progress)
+        progress.show("drawing ...")
+        picture = directory / "mfpt.png"
+        _draw(controller, model, args, result, picture)
+    result["files"] = {
+        "bag": str(directory / "bag"),
+        "picture": str(picture),
+        "logs": str(directory / "logs"),
+        "result": str(directory / "result.json"),
+    }
+    text = json_text(result)
+    (directory / "result.json").write_text(text + "\n")
+    print(text if args.json else _report(result))
+
+
+def _namespace(name: str) -> str:
+    """A namespace with a leading slash, of characters that ROS allows."""
+    name = "/" + re.sub(r"[-.]", "_", name.strip("/"))
+    if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", name):
+        raise InputError("--namespace", name, "letters, digits and _, not starting with a digit")
+    return name
+
+
+def _new_directory(output: str | None, name: str) -> Path:
+    """Make the directory of the run."""
+    if output is not None:
+        directory = Path(output)
+        try:
+            directory.mkdir(parents=True)
+        except FileExistsError:
+            raise InputError("--output", output, "a directory that does not exist yet") from None
+        return directory
+    for count in range(1, 1000):
+        directory = Path("runs", name if count == 1 else f"{name}-{count}")
+        try:
+            directory.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return directory
+    raise CommandError(f"there are too many directories runs/{name}")
+
+
+class _Pipeline:
+    """The nodes of a run and what is asked of them."""
+
+    def __init__(
+        self, processes: Processes, progress: Progress, namespace: str, directory: Path
+    ) -> None:
+        self._processes = processes
+        self._progress = progress
+        self._namespace = namespace
+        self._bag = directory / "bag"
+        self._simulators: set[str] = set()
+
+    def start(self, workers: int, mean: float, sigmas: list[float]) -> None:
+        """Start the nodes."""
+        # The recorder is stopped last, so that it hears what the others say to the end.
+        self._node("recorder", "recorder", last=True, bag=f"'{self._bag.absolute()}'")
+        self._node("mesher", "mesher")
+        self._node("analysis", "analysis", mu_s=mean, sigma_s=sigmas)
+        self._simulators = {f"simulator_{i}" for i in range(1, workers + 1)}
+        for name in sorted(self._simulators):
+            self._node(name, "simulator")
+
+    def _node(self, name: str, executable: str, last: bool = False, **parameters: object) -> None:
+        command = [sys.executable, "-m", "biped_mfpt_ros.cli", "node", executable]
+        command[-1:-1] = ["--end-with", str(os.getpid())]
+        command += ["--ros-args", "-r", f"__ns:={self._namespace}", "--disable-external-lib-logs"]
+        for key, value in parameters.items():
+            command += ["-p", f"{key}:={value}"]
+        environment = os.environ | {"RCUTILS_COLORIZED_OUTPUT": "0", "PYTHONUNBUFFERED": "1"}
+        self._processes.start(name, command, environment=environment, last=last)
+
+    def mesh(self, settings: Any, mean: float, sigmas: dict[float, float]) -> dict[str, Any]:
+        """Grow the mesh and get its MFPT for each sigma (rad to degrees)."""
+        from biped_mfpt_ros.cli.client import Client
+
+        with Client(self._namespace, self._watch) as client:
+            client.wait(partial(self._up, client), _START_TIMEOUT, "the nodes to come up")
+            text = MeshProgress()
+
+            def feedback(message: Any) -> None:
+                self._progress.show(
+                    text.text(
+                        generation=message.generation,
+                        states=message.states,
+                        frontier=message.frontier,
+                        swings_per_second=message.swings_per_second,
+                        simulators=message.simulators,
+                    )
+                )
+
+            grown = client.grow_mesh(settings, feedback)
+            self._progress.show("waiting for the analysis ...")
+            estimates = client.published_mfpt(grown.mesh_id, mean, list(sigmas), _RESULT_TIMEOUT)
+            low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)
+            curve = client.compute_mfpt(
+                grown.mesh_id, mean, list(np.linspace(low, high, _CURVE_POINTS))
+            )
+            return {
+                "mesh_id": grown.mesh_id,
+                "threshold": settings.threshold,
+                "clustered": settings.clustered,
+                "states": grown.states,
+                "generations": grown.generations,
+                "swings": grown.swings,
+                "chunks_repeated": grown.chunks_repeated,
+                "seconds": grown.seconds,
+                "step_map_seconds": grown.step_map_seconds,
+                "estimates": [
+                    _estimate(estimate, sigma_deg, settings.controller.name, mean)
+                    for estimate, sigma_deg in zip(estimates, sigmas.values(), strict=True)
+                ],
+                "curve": [{"sigma": e.sigma_s, "mfpt": e.mfpt} for e in curve],
+            }
+
+    def _up(self, client: Any) -> bool:
+        peers = client.peers()
+        missing = [what for what, there in asdict(peers).items() if not there]
+        self._progress.show(f"starting; waiting for {', '.join(missing)}")
+        return not missing
+
+    def _watch(self) -> None:
+        """End the run when a node that it cannot do without has ended."""
+        for child in self._processes.newly_ended():
+            self._simulators.discard(child.name)
+            message = f"{child.name} {child.ending()}; the end of {child.log}:\n{child.log_tail()}"
+            if not child.name.startswith("simulator") or not self._simulators:
+                raise CommandError(message)
+            self._progress.say(f"{message}\ngoing on with {len(self._simulators)} simulator(s)")
+
+
+def _estimate(message: Any, sigma_deg: float, controller: str, mean: float) -> dict[str, Any]:
+    codes = zip(message.failure_codes, message.failure_shares, strict=True)
+    return estimate_row(
+        controller, mean, sigma_deg, message, {Outcome(code): share for code, share in codes}
+    )
+
+
+def _walks(
+    controller: Controller,
+    model: WalkerModel,
+    mean: float,
+    args: argparse.Namespace,
+    estimates: list[dict[str, Any]],
+    progress: Progress,
+) -> list[dict[str, Any]]:
+    """Monte Carlo where the robot falls soon enough."""
+    out = []
+    for row in estimates:
+        if args.walks == 0 or not args.walks * row["mfpt"] <= _MOST_SWINGS:
+            continue
+        found = monte_carlo(
+            controller,
+            row["sigma"],
+            args.walks,
+            args.seed,
+            mu_s=mean,
+            model=model,
+            progress=_counting(progress, f"Monte Carlo at sigma {row['sigma_deg']:g} deg"),
+        )
+        out.append(
+            {"sigma": row["sigma"], "sigma_deg": row["sigma_deg"]}
+            | {"walks": args.walks, "seed": args.seed}
+            | monte_carlo_result(found)
+            | {"paper": paper.monte_carlo(controller.name, args.mean, row["sigma_deg"])}
+        )
+    return out
+
+
+def _counting(progress: Progress, label: str) -> Callable[[int, int], None]:
+    return lambda done, total: progress.count(label, done, total, "walks")
+
+
+def _draw(
+    controller: Controller,
+    model: WalkerModel,
+    args: argparse.Namespace,
+    result: dict[str, Any],
+    path: Path,
+) -> None:
+    """Draw MFPT over sigma beside a walk on slopes of the largest sigma that was asked for."""
+    from biped_mfpt_ros.report import pictures
+
+    sigma_deg = max(args.sigma)
+    state = find_limit_cycle(controller, 0.0, model).state
+    walking = pictures.example_walk(
+        controller, state, math.radians(args.mean), math.radians(sigma_deg), _PICTURE_STEPS, model
+    )
+    points = [
+        (row["sigma_deg"], row["paper"], kind)
+        for kind, rows in (("mesh", result["estimates"]), ("Monte Carlo", result["monte_carlo"]))
+        for row in rows
+        if row["paper"] is not None
+    ]
+    pictures.save_run(
+        path,
+        f"{controller.name} on rough ground",
+        walking,
+        f"a walk on slopes with a standard deviation of {sigma_deg:g}°",
+        np.degrees([point["sigma"] for point in result["curve"]]),
+        np.array([point["mfpt"] for point in result["curve"]]),
+        points,
+        [
+            (row["sigma_deg"], row["mean_steps"], *row["confidence_interval"])
+            for row in result["monte_carlo"]
+        ],
+    )
+
+
+def _report(result: dict[str, Any]) -> str:
+    """What a reader wants to know."""
+    parts = [
+        f"{result['controller']}: {result['states']} states in {result['generations']} generations "
+        f"by {result['workers']} simulators, {duration_text(result['seconds'])}",
+        mfpt_table(result["estimates"]),
+    ]
+    if result["monte_carlo"]:
+        rows = []
+        for row in result["monte_carlo"]:
+            low, high = row["confidence_interval"]
+            reference = row["paper"]
+            rows.append(
+                (
+                    f"{row['sigma_deg']:g} deg",
+                    row["mean_steps"],
+                    f"{number(low)} to {number(high)}",
+                    reference,
+                    "" if reference is None else difference(row["mean_steps"], reference),
+                )
+            )
+        headers = ("sigma", "Monte Carlo", "95 % confidence", "paper", "difference")
+        parts.append(table(headers, rows))
+    parts.append(
+        "\n".join(f"{name:<8} {path}" for name, path in result["files"].items() if name != "result")
+    )
+    return "\n\n".join(parts)

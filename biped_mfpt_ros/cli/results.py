@@ -1,0 +1,73 @@
+"""Results of walks and meshes: for JSON and for readers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from biped_mfpt_ros.gait.monte_carlo import MonteCarlo
+from biped_mfpt_ros.report import paper
+from biped_mfpt_ros.report.tables import difference, table
+from biped_mfpt_ros.walker.outcome import Outcome
+
+
+def monte_carlo_result(result: MonteCarlo) -> dict[str, Any]:
+    """What a Monte Carlo found, for JSON."""
+    return {
+        "mean_steps": result.mean_steps,
+        "standard_error": result.standard_error,
+        "confidence_interval": result.confidence_interval,
+        "counted_walks": result.counted.size,
+        "falls": result.falls,
+        "stopped_walks": int((result.outcomes == Outcome.STEP).sum()),
+        "failure_shares": shares(result.failure_shares),
+    }
+
+
+def shares(values: dict[Outcome, float]) -> dict[str, float]:
+    """Failure shares by the outcome's name, for JSON, the largest first."""
+    ordered = sorted(values.items(), key=lambda item: -item[1])
+    return {outcome.name.lower(): share for outcome, share in ordered if share > 0.0}
+
+
+def shares_table(values: dict[Outcome, float]) -> str:
+    """Failure shares for readers."""
+    rows = [
+        (name.replace("_", " "), f"{100.0 * share:.1f} %") for name, share in shares(values).items()
+    ]
+    return table(("fall", "share"), rows) if rows else "no falls"
+
+
+def estimate_row(
+    controller: str, mean_deg: float, sigma_deg: float, found: Any, falls: dict[Outcome, float]
+) -> dict[str, Any]:
+    """An estimate of the MFPT, for JSON; ``found`` has mfpt, failure_probability, lambda_2."""
+    return {
+        "sigma": math.radians(sigma_deg),
+        "sigma_deg": sigma_deg,
+        "mfpt": found.mfpt,
+        "failure_probability": found.failure_probability,
+        "lambda_2": found.lambda_2,
+        "failure_shares": shares(falls),
+        "paper": paper.mfpt(controller, mean_deg, sigma_deg),
+    }
+
+
+def mfpt_table(estimates: Sequence[dict[str, Any]]) -> str:
+    """MFPT beside the paper's, with what the robot falls of, for readers."""
+    rows = []
+    for row in estimates:
+        falls = [f"{name.replace('_', ' ')} {100.0 * share:.0f} %"
+                 for name, share in list(row["failure_shares"].items())[:3]]  # fmt: skip
+        reference = row["paper"]
+        rows.append(
+            (
+                f"{row['sigma_deg']:g} deg",
+                row["mfpt"],
+                reference,
+                "" if reference is None else difference(row["mfpt"], reference),
+                ", ".join(falls),
+            )
+        )
+    return table(("sigma", "MFPT in steps", "paper", "difference", "falls"), rows)

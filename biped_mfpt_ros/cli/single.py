@@ -1,0 +1,159 @@
+"""Commands that work in this process, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from biped_mfpt_ros.cli import options
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.cli.results import monte_carlo_result, shares_table
+from biped_mfpt_ros.control.controller import catalogue
+from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.gait.monte_carlo import monte_carlo as walk
+from biped_mfpt_ros.gait.step import check_states, simulate_steps
+from biped_mfpt_ros.report import paper
+from biped_mfpt_ros.report.progress import Progress
+from biped_mfpt_ros.report.tables import number, table
+from biped_mfpt_ros.walker.outcome import Outcome
+
+
+def step(args: argparse.Namespace) -> None:
+    """Simulate one step."""
+    controller, model = options.controller_of(args), options.model_of(args)
+    previous = options.slope("--previous-slope", args.previous_slope)
+    slope = options.slope("--slope", args.slope)
+    states = check_states([args.state])
+    steps = simulate_steps(controller, states, [previous], [slope], model)
+    outcome = Outcome(int(steps.outcomes[0, 0]))
+    result = options.described(controller, model) | {
+        "state": states[0],
+        "previous_slope": previous,
+        "slope": slope,
+        "outcome": outcome.name.lower(),
+        "outcome_code": int(outcome),
+        "next_state": steps.next_states[0] if outcome is Outcome.STEP else None,
+        "duration": steps.durations[0, 0],
+        "step_length": steps.step_lengths[0, 0],
+        "energy": steps.energies[0, 0],
+    }
+    if args.json:
+        print(json_text(result))
+        return
+    print(f"outcome      {outcome.label} (code {int(outcome)})")
+    print(f"duration     {number(float(result['duration']))} s")
+    if outcome is Outcome.STEP:
+        print(f"step length  {number(float(result['step_length']))} m")
+        print(f"energy       {number(float(result['energy']))} J")
+        print(f"next state   {_state_text(steps.next_states[0])}")
+
+
+def cycle(args: argparse.Namespace) -> None:
+    """Find a limit cycle."""
+    controller, model = options.controller_of(args), options.model_of(args)
+    slope = options.slope("--slope", args.slope)
+    found = find_limit_cycle(controller, slope, model)
+    magnitudes = np.abs(found.eigenvalues)
+    if args.json:
+        result = options.described(controller, model) | {
+            "slope": slope,
+            "state": found.state,
+            "period": found.period,
+            "step_length": found.step_length,
+            "speed": found.speed,
+            "cost_of_transport": found.cost_of_transport,
+            "stable": found.stable,
+            "eigenvalues": found.eigenvalues,
+            "eigenvalue_magnitudes": magnitudes,
+            "residual": found.residual,
+        }
+        print(json_text(result))
+        return
+    rows = [
+        ("period", f"{found.period:.4f} s"),
+        ("step length", f"{found.step_length:.4f} m"),
+        ("speed", f"{found.speed:.4f} m/s{_beside(paper.speed(controller.name, args.slope))}"),
+        (
+            "cost of transport",
+            f"{found.cost_of_transport:.4f}"
+            f"{_beside(paper.cost_of_transport(controller.name, args.slope))}",
+        ),
+        ("eigenvalues", ", ".join(f"{m:.4f}" for m in magnitudes if m > 1e-4) + " in magnitude"),
+        ("stable", "yes" if found.stable else "no"),
+        ("state", _state_text(found.state)),
+    ]
+    print("\n".join(f"{name:<18} {value}" for name, value in rows))
+
+
+def monte_carlo(args: argparse.Namespace) -> None:
+    """Walk on random slopes until the fall."""
+    controller, model = options.controller_of(args), options.model_of(args)
+    mean, sigma = options.slope("--mean", args.mean), options.spread("--sigma", args.sigma)
+    with Progress(quiet=args.quiet) as progress:
+        result = walk(
+            controller,
+            sigma,
+            args.walks,
+            args.seed,
+            mu_s=mean,
+            model=model,
+            max_steps=args.max_steps,
+            progress=lambda done, total: progress.count("monte-carlo", done, total, "walks"),
+        )
+        seconds = progress.seconds
+    reference = paper.monte_carlo(controller.name, args.mean, args.sigma)
+    if args.json:
+        print(
+            json_text(
+                options.described(controller, model)
+                | {"mean_slope": mean, "sigma": sigma, "walks": args.walks, "seed": args.seed}
+                | monte_carlo_result(result)
+                | {"max_steps": args.max_steps, "seconds": seconds, "paper": reference}
+            )
+        )
+        return
+    low, high = result.confidence_interval
+    print(
+        f"{controller.name}: {number(result.mean_steps)} steps to a fall on average"
+        f"{_beside(reference)}, 95 % confidence {number(low)} to {number(high)}"
+    )
+    print(
+        f"{args.walks} walks, {result.counted.size} counted (more than one step), "
+        f"{result.falls} falls"
+    )
+    print(shares_table(result.failure_shares))
+
+
+def controllers(args: argparse.Namespace) -> None:
+    """List the catalogue."""
+    rows = [paper.figures(name) for name in catalogue()]
+    if args.json:
+        print(json_text({"controllers": rows}))
+        return
+    print(
+        table(
+            ("controller", "speed", "cost of transport", "MFPT at 1 deg", "Monte Carlo", "at"),
+            [
+                (
+                    row["controller"],
+                    row["speed"],
+                    row["cost_of_transport"],
+                    row["mfpt"],
+                    row["mean_steps"],
+                    f"{row['mean_steps_sigma_deg']:g} deg",
+                )
+                for row in rows
+            ],
+        )
+    )
+    print("\nAs the paper gives them; speed in m/s, MFPT and Monte Carlo in steps.")
+
+
+def _beside(reference: float | None) -> str:
+    return "" if reference is None else f" (paper: {number(reference)})"
+
+
+def _state_text(state: np.ndarray) -> str:
+    """A state as `--state` takes it; rounded far below what a walk can feel."""
+    return ",".join(f"{value:.9g}" for value in state)

@@ -1,0 +1,266 @@
+"""Pictures, drawn with matplotlib into files; no display is needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from biped_mfpt_ros.control.controller import Controller
+from biped_mfpt_ros.gait.trace import trace_swing
+from biped_mfpt_ros.walker.dynamics import to_absolute
+from biped_mfpt_ros.walker.outcome import Outcome
+from biped_mfpt_ros.walker.robot import Robot, WalkerModel
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
+
+_OURS, _PAPER, _STANCE, _SWING, _BODY, _GROUND = (
+    "#1f5fa8", "#d1495b", "#1f5fa8", "#e08e1b", "#333a45", "#8a7f72",
+)  # fmt: skip
+_INTERVAL = 0.085  # s between the figures of a sequence
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Figures of a robot that walks, for a picture.
+
+    Attributes
+    ----------
+    points : numpy.ndarray
+        m, shape (k, 6, 2): stance foot, stance knee, hip, head, swing knee, swing foot.
+    steps : numpy.ndarray
+        Number of the step that each figure belongs to, shape (k,).
+    feet : numpy.ndarray
+        m, shape (steps + 1, 2): where the stance feet stand, then where the last step leads.
+    slopes : numpy.ndarray
+        rad, shape (steps + 1,): behind the first stance foot, then ahead of each.
+    outcome : Outcome
+        How the last step ended.
+    """
+
+    points: np.ndarray
+    steps: np.ndarray
+    feet: np.ndarray
+    slopes: np.ndarray
+    outcome: Outcome
+
+
+def link_points(states: np.ndarray, robot: Robot) -> np.ndarray:
+    """Ends of the links, from the stance foot.
+
+    Parameters
+    ----------
+    states : numpy.ndarray
+        ``[q, dq]``, rad and rad/s, shape (k, 10).
+    robot : Robot
+        The links.
+
+    Returns
+    -------
+    numpy.ndarray
+        m, shape (k, 6, 2): stance foot, stance knee, hip, head, swing knee, swing foot.
+    """
+    angles = to_absolute(states)[:, :5]
+    along = np.stack([-np.sin(angles), np.cos(angles)], axis=-1)
+    stance_knee = -robot.tibia_length * along[:, 2]
+    hip = stance_knee - robot.femur_length * along[:, 0]
+    head = hip + robot.torso_length * along[:, 4]
+    swing_knee = hip + robot.femur_length * along[:, 1]
+    swing_foot = swing_knee + robot.tibia_length * along[:, 3]
+    foot = np.zeros_like(hip)
+    return np.stack([foot, stance_knee, hip, head, swing_knee, swing_foot], axis=1)
+
+
+def walk(
+    controller: Controller,
+    state: np.ndarray,
+    slopes: Sequence[float],
+    model: WalkerModel,
+    interval: float = _INTERVAL,
+) -> Walk:
+    """Walk over given slopes, or to the fall, and keep figures at regular times.
+
+    Parameters
+    ----------
+    controller : Controller
+        What walks.
+    state : numpy.ndarray
+        ``[q, dq]`` after an impact on flat ground, shape (10,).
+    slopes : sequence of float
+        rad, ahead of each step.
+    model : WalkerModel
+        Torque limit, friction and so on.
+    interval : float, optional
+        s between figures.
+    """
+    foot, previous, late = np.zeros(2), 0.0, 0.0
+    points, steps, feet, passed = [], [], [foot], [previous]
+    outcome = Outcome.STEP
+    for number, slope in enumerate(slopes):
+        swing = trace_swing(controller, state, previous, slope, model)
+        passed.append(slope)
+        end = swing.times[-1] if swing.times.size else 0.0
+        times = np.arange(late, end, interval)
+        if times.size:
+            sampled = np.stack(
+                [np.interp(times, swing.times, column) for column in swing.states.T], axis=1
+            )
+            points.append(link_points(sampled, model.robot) + foot)
+            steps.append(np.full(times.size, number))
+            late = times[-1] + interval - end
+        else:
+            late -= end
+        outcome = swing.outcome
+        last = link_points(swing.states[-1:], model.robot)[0] + foot
+        if swing.next_state is None:
+            points.append(last[None])
+            steps.append(np.full(1, number))
+            feet.append(foot + math.cos(slope) * np.array([0.45, 0.45 * math.tan(slope)]))
+            break
+        foot, state, previous = last[5], swing.next_state, slope
+        feet.append(foot)
+    return Walk(
+        np.concatenate(points), np.concatenate(steps), np.array(feet), np.array(passed), outcome
+    )
+
+
+def example_walk(
+    controller: Controller,
+    state: np.ndarray,
+    mu_s: float,
+    sigma_s: float,
+    steps: int,
+    model: WalkerModel,
+) -> Walk:
+    """Walk on random slopes for a picture: up to ``steps`` steps, of the first walks the longest.
+
+    Slopes (rad, mean ``mu_s``, standard deviation ``sigma_s``) come from fixed seeds, so that the
+    picture is always the same.
+    """
+    best: Walk | None = None
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        slopes = np.clip(mu_s + sigma_s * random.standard_normal(steps), -SLOPE_LIMIT, SLOPE_LIMIT)
+        found = walk(controller, state, slopes, model)
+        if best is None or found.steps[-1] > best.steps[-1]:
+            best = found
+        if best.steps[-1] == steps - 1:
+            break
+    assert best is not None
+    return best
+
+
+def draw_walk(axes: Axes, walking: Walk) -> None:
+    """Draw a walk as a sequence of stick figures on its ground."""
+    feet = walking.feet
+    back = feet[0] - 0.5 * np.array([math.cos(walking.slopes[0]), math.sin(walking.slopes[0])])
+    ahead = walking.slopes[-1]
+    front = feet[-1] + 0.25 * np.array([math.cos(ahead), math.sin(ahead)])
+    ground = np.vstack([back, feet, front])
+    low = ground[:, 1].min() - 0.12
+    axes.fill_between(ground[:, 0], ground[:, 1], low, color=_GROUND, alpha=0.25, linewidth=0)
+    axes.plot(ground[:, 0], ground[:, 1], color=_GROUND, linewidth=1.4)
+    last = len(walking.points) - 1
+    for i, (points, step) in enumerate(zip(walking.points, walking.steps, strict=True)):
+        # A leg keeps its colour: it is the stance leg in every second step.
+        legs = (_STANCE, _SWING) if step % 2 == 0 else (_SWING, _STANCE)
+        strong = i in (0, last)
+        alpha, width = (0.95, 2.2) if strong else (0.45, 1.1)
+        style = {"alpha": alpha, "linewidth": width, "solid_capstyle": "round"}
+        axes.plot(*points[[0, 1, 2]].T, color=legs[0], solid_joinstyle="round", **style)
+        axes.plot(*points[[5, 4, 2]].T, color=legs[1], solid_joinstyle="round", **style)
+        axes.plot(*points[[2, 3]].T, color=_BODY, **style)
+        axes.plot(*points[3], "o", color=_BODY, alpha=alpha, markersize=3.4 if strong else 2.0)
+    if walking.outcome is not Outcome.STEP:
+        foot = walking.points[-1, 5]
+        axes.plot(*foot, "o", color=_PAPER, markersize=9, fillstyle="none", markeredgewidth=1.8)
+        axes.annotate(
+            walking.outcome.label, foot, (8, 10), textcoords="offset points", color=_PAPER
+        )
+    axes.set_aspect("equal")
+    axes.set_xlim(ground[0, 0], ground[-1, 0])
+    axes.set_ylim(low, max(ground[:, 1].max(), walking.points[:, 3, 1].max()) + 0.12)
+    axes.set_xlabel("m")
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(left=False, labelleft=False)
+
+
+def draw_mfpt(
+    axes: Axes,
+    sigma_deg: np.ndarray,
+    mfpt: np.ndarray,
+    paper: Sequence[tuple[float, float, str]] = (),
+    monte_carlo: Sequence[tuple[float, float, float, float]] = (),
+) -> None:
+    """Draw MFPT over the standard deviation of the slope, on a logarithmic axis.
+
+    Parameters
+    ----------
+    axes : matplotlib.axes.Axes
+        Where to draw.
+    sigma_deg, mfpt : numpy.ndarray
+        Degrees and steps, shape (k,).
+    paper : sequence of (float, float, str)
+        Degrees, steps, and what that figure of the paper is: ``"mesh"`` or ``"Monte Carlo"``.
+    monte_carlo : sequence of (float, float, float, float)
+        Degrees, steps, and their confidence interval.
+    """
+    finite = np.isfinite(mfpt)
+    axes.plot(sigma_deg[finite], mfpt[finite], color=_OURS, linewidth=2.0, label="our mesh")
+    if monte_carlo:
+        at, steps, low, high = np.array(monte_carlo).T
+        axes.errorbar(
+            at, steps, [steps - low, high - steps], fmt="s", color=_BODY, markersize=4.5, capsize=3,
+            label="our Monte Carlo, 95 %",
+        )  # fmt: skip
+    for kind, marker in (("mesh", "o"), ("Monte Carlo", "D")):
+        at_steps = [(at, steps) for at, steps, which in paper if which == kind]
+        if at_steps:
+            axes.plot(
+                *np.array(at_steps).T, marker, color=_PAPER, markersize=7, fillstyle="none",
+                markeredgewidth=1.8, label=f"paper, {kind}",
+            )  # fmt: skip
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(numticks=10))
+    axes.yaxis.set_major_formatter(FuncFormatter(_power_of_ten))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylim(bottom=1.0)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("standard deviation of the slope, degrees")
+    axes.set_ylabel("mean steps to a fall")
+    axes.grid(which="major", color="#d9dde3", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+
+
+def save_run(
+    path: Path,
+    title: str,
+    walking: Walk,
+    walk_title: str,
+    sigma_deg: np.ndarray,
+    mfpt: np.ndarray,
+    paper: Sequence[tuple[float, float, str]] = (),
+    monte_carlo: Sequence[tuple[float, float, float, float]] = (),
+) -> None:
+    """Save the picture of a run: MFPT over the roughness beside a walk; see `draw_mfpt`."""
+    figure = Figure(figsize=(13.0, 4.6), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.75])
+    draw_mfpt(left, sigma_deg, mfpt, paper, monte_carlo)
+    left.set_title(title, fontsize=11, loc="left")
+    draw_walk(right, walking)
+    right.set_title(walk_title, fontsize=11, loc="left")
+    figure.savefig(path)
+
+
+def _power_of_ten(value: float, position: int | None) -> str:
+    exponent = round(math.log10(value))
+    return f"{value:g}" if 0 <= exponent <= 3 else f"$10^{{{exponent}}}$"

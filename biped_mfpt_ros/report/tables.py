@@ -1,0 +1,62 @@
+"""Plain text tables and the numbers in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+
+def table(headers: Sequence[str], rows: Iterable[Sequence[object]], indent: str = "") -> str:
+    """Lay out a table with aligned columns.
+
+    Parameters
+    ----------
+    headers : sequence of str
+        One for each column.
+    rows : iterable of sequence
+        Cells; anything but a string is shown with `number`. A column whose cells are all strings
+        is aligned left, every other one right.
+    indent : str, optional
+        Put before every line.
+
+    Returns
+    -------
+    str
+        Lines without a newline at the end.
+    """
+    cells = [list(row) for row in rows]
+    for row in cells:
+        if len(row) != len(headers):
+            raise ValueError(f"a row of {len(row)} cells under {len(headers)} headers: {row}")
+    left = [all(isinstance(row[i], str) for row in cells) for i in range(len(headers))]
+    lines = [list(headers)]
+    lines += [[cell if isinstance(cell, str) else number(cell) for cell in row] for row in cells]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(headers))]
+    lines.insert(1, ["-" * width for width in widths])
+    return "\n".join(
+        (
+            indent
+            + "  ".join(
+                cell.ljust(width) if to_left else cell.rjust(width)
+                for cell, width, to_left in zip(line, widths, left, strict=True)
+            )
+        ).rstrip()
+        for line in lines
+    )
+
+
+def number(value: object) -> str:
+    """A number for a reader: five significant digits, ``"-"`` for None."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return str(value)
+    if isinstance(value, int) or math.isinf(value) or math.isnan(value):
+        return str(value)
+    return f"{value:.5g}" if 1e-3 <= abs(value) < 1e5 or value == 0.0 else f"{value:.3e}"
+
+
+def difference(value: float, reference: float) -> str:
+    """Difference from a reference in percent, such as ``"+3.2 %"``."""
+    percent = 100.0 * (value / reference - 1.0)
+    return f"{percent:+.1f} %" if abs(percent) < 1000.0 else f"{percent:+.2e} %"

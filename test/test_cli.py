@@ -1,0 +1,398 @@
+"""The command line: what scripts rely on, what users see when input is bad, and child processes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from biped_mfpt_ros.cli import main
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.cli.parser import make_parser
+from biped_mfpt_ros.cli.processes import Processes, Stopped
+from biped_mfpt_ros.walker.robot import WalkerModel
+
+# On the limit cycle of hzd/base.
+STATE = "3.61509750,3.03490073,-0.41620570,-0.319999,-0.01578744,0.37414059,-1.91681554,-3.56197438"
+STATE += ",1.02274997,0.14075185"
+
+COMMAND = [sys.executable, "-m", "biped_mfpt_ros.cli"]
+
+
+def run_json(capsys, *arguments):
+    assert main([*arguments, "--json", "--quiet"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+
+    def refuse(text):
+        raise AssertionError(f"not JSON: {text}")
+
+    return json.loads(captured.out, parse_constant=refuse)
+
+
+def run_bad(capsys, *arguments):
+    """Run with bad input; return the one line on stderr."""
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    return line
+
+
+class TestInProcess:
+    def test_step(self, capsys):
+        result = run_json(
+            capsys, "step", "--controller", "hzd/base", "--state", STATE,
+            "--previous-slope", "0", "--slope", "-2",
+        )  # fmt: skip
+        assert result["controller"] == "hzd/base"
+        assert result["outcome"] == "step"
+        assert result["outcome_code"] == 0
+        assert result["slope"] == pytest.approx(math.radians(-2.0), rel=1e-15)
+        assert len(result["next_state"]) == 10
+        # A step downhill is longer than that of the cycle on the flat: 0.4135 m and 0.5168 s.
+        assert 0.4135 < result["step_length"] < 0.5
+        assert 0.5168 < result["duration"] < 0.7
+        assert result["energy"] > 0.0
+
+    def test_step_equals_the_core(self, capsys):
+        from biped_mfpt_ros.control.controller import controller
+        from biped_mfpt_ros.gait.step import simulate_steps
+
+        result = run_json(
+            capsys, "step", "--controller", "hzd/base", "--state", STATE, "--slope", "-1e0",
+            "--previous-slope", ".5", "--torque-limit", "none", "--friction", "0.7",
+        )  # fmt: skip
+        steps = simulate_steps(
+            controller("hzd/base"),
+            [[float(x) for x in STATE.split(",")]],
+            [math.radians(0.5)],
+            [math.radians(-1.0)],
+            WalkerModel(torque_limit=math.inf, friction=0.7),
+        )
+        assert result["model"]["torque_limit"] == "inf"
+        assert result["outcome_code"] == steps.outcomes[0, 0]
+        assert result["duration"] == steps.durations[0, 0]
+        np.testing.assert_array_equal(result["next_state"], steps.next_states[0])
+
+    def test_step_that_falls(self, capsys):
+        # The stance leg points up: the foot is nowhere near the ground.
+        state = "-1e-3" + STATE[STATE.index(",") :]
+        result = run_json(
+            capsys, "step", "--controller", "hzd/base", "--state", state, "--previous-slope", "-.5"
+        )
+        assert result["previous_slope"] == pytest.approx(math.radians(-0.5), rel=1e-15)
+        assert result["outcome"] != "step"
+        assert result["outcome_code"] != 0
+        assert result["next_state"] is None
+        assert result["step_length"] == 0.0
+        assert main(["step", "--controller", "hzd/base", "--state", state]) == 0
+        assert result["outcome"].replace("_", " ") in capsys.readouterr().out
+
+    def test_cycle(self, capsys):
+        result = run_json(capsys, "cycle", "--controller", "hzd/base")
+        # The paper's gait was designed for 0.8 m/s; its parameters are rounded to four digits.
+        assert result["speed"] == pytest.approx(0.8, abs=5e-4)
+        assert result["speed"] == pytest.approx(result["step_length"] / result["period"])
+        assert len(result["state"]) == 10
+        values = np.array([complex(re, im) for re, im in result["eigenvalues"]])
+        np.testing.assert_allclose(np.abs(values), result["eigenvalue_magnitudes"], rtol=1e-12)
+        assert result["stable"] is True
+        assert result["eigenvalue_magnitudes"][0] < 1.0
+
+    def test_state_of_cycle_is_read_by_step(self, capsys):
+        assert main(["cycle", "--controller", "hzd/base"]) == 0
+        (line,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith("state "))
+        result = run_json(capsys, "step", "--controller", "hzd/base", "--state", line.split()[1])
+        # The printed state has nine digits.
+        np.testing.assert_allclose(result["next_state"], result["state"], atol=1e-6)
+
+    def test_no_cycle(self, capsys):
+        code = main(["cycle", "--controller", "hzd/base", "--slope", "30", "--json"])
+        captured = capsys.readouterr()
+        assert code == 1
+        assert captured.out == ""
+        (line,) = captured.err.splitlines()
+        assert "no limit cycle of hzd/base" in line
+        assert "30 degrees" in line
+
+    def test_monte_carlo(self, capsys):
+        arguments = ("monte-carlo", "--controller", "hzd/cot", "--sigma", "2", "--walks", "300")
+        result = run_json(capsys, *arguments, "--seed", "1")
+        assert result["walks"] == 300
+        assert result["seed"] == 1
+        assert result["sigma"] == pytest.approx(math.radians(2.0), rel=1e-15)
+        assert result["paper"] == 2.2487
+        low, high = result["confidence_interval"]
+        assert low < result["mean_steps"] < high
+        assert sum(result["failure_shares"].values()) == pytest.approx(1.0, abs=1e-12)
+        again = run_json(capsys, *arguments, "--seed", "1")
+        other = run_json(capsys, *arguments, "--seed", "2")
+        assert again["mean_steps"] == result["mean_steps"] != other["mean_steps"]
+
+    def test_controllers(self, capsys):
+        result = run_json(capsys, "controllers")
+        names = [row["controller"] for row in result["controllers"]]
+        assert names == ["hzd/base", "hzd/cot", "hzd/mfpt", "smc/base", "smc/cot", "smc/mfpt"]
+        assert result["controllers"][2]["mfpt"] == 113.1
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("arguments", "field", "value"),
+        [
+            (["step", "--state", "1,2,3"], "--state", "1,2,3"),
+            (["step", "--state", STATE.replace("3.03490073", "nan")], "--state", "nan"),
+            (["step", "--state", "-" + STATE, "--slope", "-60"], "--slope", "-60"),
+            (["step", "--state", STATE, "--slope", "nan"], "--slope", "nan"),
+            (["step", "--state", STATE, "--slope", "-x"], "--slope", None),
+            (["step", "--state", STATE, "--previous-slope", "1e9"], "--previous-slope", "1000000"),
+            (["step", "--state", STATE, "--controller", "hzd/none"], "--controller", "hzd/none"),
+            (["step", "--state", STATE, "--torque-limit", "0"], "--torque-limit", "0.0"),
+            (["step", "--state", STATE, "--friction", "nan"], "--friction", "nan"),
+            (["step", "--state", STATE, "--slip-duration", "-1"], "--slip-duration", "-1"),
+            (["step", "--state", STATE, "--time-limit", "0"], "--time-limit", "0.0"),
+            (["step", "--state", STATE, "--tolerance", "1"], "--tolerance", "1"),
+            (["step"], "--state", None),
+            (["monte-carlo", "--sigma", "-2"], "--sigma", "-2"),
+            (["monte-carlo", "--sigma", "inf"], "--sigma", "inf"),
+            (["monte-carlo", "--sigma", "two"], "--sigma", "two"),
+            (["monte-carlo", "--sigma", "2", "--walks", "0"], "--walks", "0"),
+            (["monte-carlo", "--sigma", "2", "--walks", "1.5"], "--walks", "1.5"),
+            (["monte-carlo", "--sigma", "2", "--seed", "-1"], "--seed", "-1"),
+            (["monte-carlo", "--sigma", "2", "--mean", "-90"], "--mean", "-90"),
+            (["monte-carlo", "--sigma", "2", "--max-steps", "0"], "--max-steps", "0"),
+            (["node", "nothing"], "NAME", "nothing"),
+            (["dance"], "COMMAND", "dance"),
+            ([], "COMMAND", None),
+            (["cycle", "--slop", "1"], "--slop", None),
+        ],
+    )
+    def test_one_line_with_field_and_value(self, capsys, arguments, field, value):
+        line = run_bad(capsys, *arguments)
+        assert line.startswith("biped-mfpt")
+        assert field in line
+        if value is not None:
+            assert value in line
+            assert "allowed: " in line or "choose from" in line
+
+    def test_missing_ros(self, capsys, monkeypatch):
+        monkeypatch.setitem(sys.modules, "rclpy", None)
+        assert main(["node", "simulator"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "rclpy" in line
+        assert "make setup" in line
+        assert "colcon build" in line
+
+    def test_bug_keeps_its_traceback(self, monkeypatch):
+        monkeypatch.setattr("biped_mfpt_ros.cli.single.catalogue", lambda: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            main(["controllers"])
+
+    def test_interrupt(self, monkeypatch):
+        def interrupt():
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("biped_mfpt_ros.cli.single.catalogue", interrupt)
+        assert main(["controllers"]) == 130
+
+
+class TestHelp:
+    def test_defaults_in_the_text_are_those_of_the_core(self):
+        parser = make_parser().parse_args(["cycle"]).parser
+        texts = {action.dest: action.help for action in parser._actions}
+        defaults = WalkerModel()
+        for option in ("torque_limit", "friction", "slip_duration", "time_limit", "tolerance"):
+            shown = texts[option].partition("(default: ")[2].rstrip(")")
+            assert float(shown) == getattr(defaults, option), option
+
+    def test_is_quick_because_nothing_heavy_is_imported(self):
+        # Time itself depends on the machine; what costs time is importing these.
+        code = (
+            "import sys; from biped_mfpt_ros.cli import main; main(['--help']);"
+            "main(['mfpt', '--help']);"
+            "print([m for m in ('numpy', 'numba', 'scipy', 'rclpy', 'matplotlib') "
+            "if m in sys.modules])"
+        )
+        out = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        assert out.splitlines()[-1] == "[]"
+
+    @pytest.mark.parametrize("name", ["run", "mfpt", "mesh", "monte-carlo", "cycle", "step"])
+    def test_every_example_is_accepted(self, name):
+        parser = make_parser()
+        epilog = parser.parse_args([name, *_required(name)]).parser.epilog
+        examples = epilog.replace("\\\n", " ").splitlines()[1:]
+        assert examples
+        for example in examples:
+            program, *arguments = example.split()
+            assert program == "biped-mfpt"
+            assert parser.parse_args(arguments).command == name
+
+
+def _required(name):
+    return {
+        "mfpt": ["--sigma", "1"],
+        "monte-carlo": ["--sigma", "1"],
+        "step": ["--state", STATE],
+    }.get(name, [])
+
+
+def test_json_text():
+    value = {
+        "a": np.array([1.0, math.inf, -math.inf, math.nan]),
+        "b": (np.float64(0.1), np.int64(3), 1j),
+        "c": {"d": True, "e": None, "f": "text"},
+    }
+    assert json.loads(json_text(value)) == {
+        "a": [1.0, "inf", "-inf", None],
+        "b": [0.1, 3, [0.0, 1.0]],
+        "c": {"d": True, "e": None, "f": "text"},
+    }
+
+
+# A child that ends on SIGTERM, one that does not, and a program that starts one and waits.
+SLEEP = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
+STUBBORN = [
+    sys.executable,
+    "-c",
+    "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
+    "print('up', flush=True); time.sleep(60)",
+]
+
+
+def wait_until_up(child):
+    deadline = time.monotonic() + 20.0
+    while "up" not in child.log.read_text():
+        assert time.monotonic() < deadline, "the child does not start"
+        time.sleep(0.01)
+
+
+def alive(pid):
+    """Whether a process exists and is no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+class TestProcesses:
+    def test_stops_in_order(self, tmp_path):
+        script = (
+            "import pathlib, signal, sys, time\n"
+            "def end(*_):\n"
+            "    with open(sys.argv[1], 'a') as f: f.write(sys.argv[2] + '\\n')\n"
+            "    sys.exit(0)\n"
+            "signal.signal(signal.SIGTERM, end)\n"
+            "print('up', flush=True)\n"
+            "time.sleep(60)\n"
+        )
+        order = tmp_path / "order"
+        with Processes(tmp_path / "logs") as processes:
+            for name, last in (("recorder", True), ("one", False), ("two", False)):
+                command = [sys.executable, "-c", script, str(order), name]
+                wait_until_up(processes.start(name, command, last=last))
+            assert [child.name for child in processes.running()] == ["recorder", "one", "two"]
+        names = order.read_text().split()
+        assert sorted(names[:2]) == ["one", "two"]
+        assert names[2:] == ["recorder"]
+        assert processes.running() == []
+
+    def test_kills_what_does_not_end(self, tmp_path):
+        with Processes(tmp_path) as processes:
+            child = processes.start("stubborn", STUBBORN)
+            wait_until_up(child)
+            start = time.monotonic()
+        assert time.monotonic() - start < 5.0
+        assert child.process.returncode == -signal.SIGKILL
+        assert child.ending() == "was killed by SIGKILL"
+
+    def test_early_end_is_reported_once_with_the_log(self, tmp_path):
+        with Processes(tmp_path) as processes:
+            command = [sys.executable, "-c", "print('last words'); raise SystemExit(3)"]
+            child = processes.start("short", command)
+            other = processes.start("long", SLEEP)
+            child.process.wait(20)
+            assert processes.newly_ended() == [child]
+            assert processes.newly_ended() == []
+            assert child.ending() == "ended with code 3"
+            assert child.log_tail() == "last words"
+            assert processes.running() == [other]
+
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+    def test_signal_raises_and_children_end(self, tmp_path, number):
+        handler = signal.getsignal(number)
+        processes = Processes(tmp_path)
+
+        def run():
+            with processes:
+                wait_until_up(processes.start("child", SLEEP))
+                assert len(processes.running()) == 1
+                os.kill(os.getpid(), number)
+                time.sleep(20)
+
+        with pytest.raises(Stopped):
+            run()
+        assert processes.running() == []
+        assert signal.getsignal(number) is handler
+
+    def test_second_signal_does_not_wait(self, tmp_path):
+        processes = Processes(tmp_path)
+        code = f"import os, time; time.sleep(0.3); os.kill({os.getpid()}, 2)"
+
+        def run():
+            with processes:
+                wait_until_up(processes.start("stubborn", STUBBORN))
+                later.append(subprocess.Popen([sys.executable, "-c", code]))
+                start.append(time.monotonic())
+                os.kill(os.getpid(), signal.SIGINT)
+
+        start, later = [], []
+        with pytest.raises(Stopped):
+            run()
+        assert time.monotonic() - start[0] < 2.0  # the grace alone takes 2 s
+        later[0].wait()
+        assert processes.running() == []
+
+    def test_children_end_with_a_killed_parent(self, tmp_path):
+        child = (
+            "import sys, time\n"
+            "from biped_mfpt_ros.cli.node import end_with\n"
+            "end_with(int(sys.argv[1]))\n"
+            "print('up', flush=True)\n"
+            "time.sleep(60)\n"
+        )
+        parent = (
+            "import os, pathlib, sys, time\n"
+            "from biped_mfpt_ros.cli.processes import Processes\n"
+            "with Processes(pathlib.Path(sys.argv[1])) as processes:\n"
+            f"    command = [sys.executable, '-c', {child!r}, str(os.getpid())]\n"
+            "    child = processes.start('child', command)\n"
+            "    while 'up' not in child.log.read_text(): time.sleep(0.01)\n"
+            "    print(child.process.pid, flush=True)\n"
+            "    time.sleep(60)\n"
+        )
+        command = [sys.executable, "-c", parent, str(tmp_path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            pid = int(process.stdout.readline())
+            assert alive(pid)
+            process.kill()
+        deadline = time.monotonic() + 5.0
+        while alive(pid):
+            assert time.monotonic() < deadline, "the child outlives its parent"
+            time.sleep(0.01)
+
+    def test_end_with_a_parent_that_is_gone(self):
+        from biped_mfpt_ros.cli.node import end_with
+
+        with pytest.raises(SystemExit):
+            end_with(os.getppid() + 1)
