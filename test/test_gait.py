@@ -91,7 +91,9 @@ def test_a_walk_is_the_step_map_again_and_again():
     for n in range(5):
         slopes = SIGMA * np.random.Generator(np.random.PCG64([3, n])).standard_normal(500)
         state, previous = find_limit_cycle(control).state, 0.0
-        for taken, slope in enumerate(slopes, 1):
+        taken = 0
+        for slope in slopes:
+            taken += 1
             steps = simulate_steps(control, [state], [previous], [slope])
             if steps.outcomes[0, 0] != Outcome.STEP:
                 break

@@ -70,7 +70,7 @@ def maximal_coordinates(a, da, pinned):
 
 def velocities(a, da):
     """Velocities (15,) of the links for absolute rates, the stance foot (tibia 2) at rest."""
-    mass, jacobian, _ = maximal_coordinates(a, da, 2)
+    _, jacobian, _ = maximal_coordinates(a, da, 2)
     out = np.zeros(15)
     out[2::3] = da
     free = np.setdiff1d(np.arange(15), np.arange(2, 15, 3))

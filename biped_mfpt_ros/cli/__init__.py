@@ -71,6 +71,8 @@ def _run(args: argparse.Namespace) -> int:
 
 # Fields of the core that are not called as the options that set them.
 _OPTIONS = {
+    "mu_s_deg": "--mean",
+    "sigma_s_deg": "--sigma",
     "states": "--state",
     "slope_step_deg": "--slope-step",
     "slope_limit_deg": "--slope-limit",

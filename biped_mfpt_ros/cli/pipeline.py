@@ -57,9 +57,11 @@ def run(args: argparse.Namespace) -> None:
     name = f"{time.strftime('%Y%m%d-%H%M%S')}-{controller.name.replace('/', '-')}"
     namespace = _namespace(args.namespace or f"run_{name}_{os.getpid()}")
     require_ros()
+    from biped_mfpt_ros.nodes.analysis import AnalysisParameters
     from biped_mfpt_ros.nodes.messages import MeshSettings
     from biped_mfpt_ros.nodes.spin import prepare_environment
 
+    AnalysisParameters(sigma_s_deg=tuple(args.sigma), mu_s_deg=args.mean)  # checks their range
     settings = MeshSettings(
         controller, model, slopes, args.threshold, **options.mesh_settings(args)
     )
@@ -79,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
         progress.say(f"running in {directory}, ROS namespace {namespace}")
         with Processes(directory / "logs") as processes:
             pipeline = _Pipeline(processes, progress, namespace, directory)
-            pipeline.start(workers, mean, sigmas)
+            pipeline.start(workers, args.mean, args.sigma)
             result |= pipeline.mesh(settings, mean, dict(zip(sigmas, args.sigma, strict=True)))
         result["monte_carlo"] = _walks(controller, model, mean, args, result["estimates"], progress)
         progress.show("drawing ...")
@@ -135,12 +137,12 @@ class _Pipeline:
         self._bag = directory / "bag"
         self._simulators: set[str] = set()
 
-    def start(self, workers: int, mean: float, sigmas: list[float]) -> None:
+    def start(self, workers: int, mean_deg: float, sigma_deg: list[float]) -> None:
         """Start the nodes."""
         # The recorder is stopped last, so that it hears what the others say to the end.
         self._node("recorder", "recorder", last=True, bag=f"'{self._bag.absolute()}'")
         self._node("mesher", "mesher")
-        self._node("analysis", "analysis", mu_s=mean, sigma_s=sigmas)
+        self._node("analysis", "analysis", mu_s_deg=mean_deg, sigma_s_deg=sigma_deg)
         self._simulators = {f"simulator_{i}" for i in range(1, workers + 1)}
         for name in sorted(self._simulators):
             self._node(name, "simulator")

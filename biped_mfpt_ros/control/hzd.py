@@ -20,8 +20,10 @@ from biped_mfpt_ros.walker.robot import ABSOLUTE, Robot, rabbit
 DEGREE = 6
 """M of eq. (12)."""
 
-PARAMETERS = ("kp", "kd") + tuple(
-    f"alpha_{k}^{i}" for i in range(1, 5) for k in range(DEGREE + 1)
+PARAMETERS = (
+    "kp",
+    "kd",
+    *(f"alpha_{k}^{i}" for i in range(1, 5) for k in range(DEGREE + 1)),
 )
 """Names of the parameters, in order: gains (1/s^2, 1/s), then coefficients (rad) joint by joint."""
 

@@ -11,8 +11,8 @@ it, nor is it of interest how fast an output settles that settles at once. So it
 twice, far above the rates of the gait (some 20/s):
 
 - By `STEEPEST` about sigma = 0: below ``(k / STEEPEST)^(1 / (2 - 2 alpha))``, some 1e-5 rad/s, the
-  law is linear. That moves an output by less than 1e-6 rad. It also covers 2 alpha - 1 <= 0, outside
-  of what the paper allows but present in its Table 3, where the law jumps at sigma = 0: the output
+  law is linear. That moves an output by some 1e-6 rad. It also covers 2 alpha - 1 <= 0, outside of
+  what the paper allows but present in its Table 3, where the law jumps at sigma = 0: the output
   then slides there (Filippov), without the chatter that a literal sign function would leave.
 - By `SLIDING_RATE` about the slow manifold, where an output in sliding mode rests with
   ``v = -dh / tau``: further off than ``|v + dh / tau| / SLIDING_RATE`` the law is eq. (21) to the

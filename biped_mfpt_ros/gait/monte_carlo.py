@@ -122,7 +122,8 @@ class MonteCarlo:
         """Share of each outcome in the falls of the counted walks."""
         fallen = self.outcomes[(self.outcomes != _STEP) & (self.steps > 1)]
         codes, counts = np.unique(fallen, return_counts=True)
-        return {Outcome(int(c)): float(k / counts.sum()) for c, k in zip(codes, counts, strict=True)}
+        shares = counts / counts.sum()
+        return {Outcome(int(c)): float(s) for c, s in zip(codes, shares, strict=True)}
 
 
 def monte_carlo(

@@ -92,7 +92,19 @@ def _land(rob, work, s, slope, after):
 
 @kernel
 def _swing(
-    scheme, rob, par, previous, slopes, s, work, outcomes, durations, lengths, energies, after, trace
+    scheme,
+    rob,
+    par,
+    previous,
+    slopes,
+    s,
+    work,
+    outcomes,
+    durations,
+    lengths,
+    energies,
+    after,
+    trace,
 ):
     """Simulate one swing and decide its outcome for every slope.
 
@@ -487,7 +499,7 @@ class Steps:
 
 
 def check_states(states: ArrayLike, field: str = "states") -> np.ndarray:
-    """Check states: shape (n, 10), finite. Returns them as contiguous float64; raises InputError."""
+    """Check states: shape (n, 10), finite; returned as contiguous float64, or InputError."""
     out = np.ascontiguousarray(states, dtype=np.float64)
     if out.ndim != 2 or out.shape[1] != STATE_SIZE:
         raise InputError(field, f"shape {out.shape}", f"shape (n, {STATE_SIZE}): q1..q5, dq1..dq5")
@@ -565,5 +577,12 @@ def simulate_steps(
     )
     seconds = time.perf_counter() - start
     return Steps(
-        outcomes, following[:count].copy(), durations, lengths, energies, seconds, steps, evaluations
+        outcomes=outcomes,
+        next_states=following[:count].copy(),
+        durations=durations,
+        step_lengths=lengths,
+        energies=energies,
+        seconds=seconds,
+        integrator_steps=steps,
+        evaluations=evaluations,
     )

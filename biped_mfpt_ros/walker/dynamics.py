@@ -5,8 +5,8 @@ With ``p_k = sum_j c_kj e(a_j)`` for every centre of mass, the inertia matrix is
 
     sum_j [D_ij dda_j + C_ij sin(a_i - a_j) da_j^2] - g w_i sin a_i = Q_i
 
-with the joint torques ``Q = (u1 - u3, u2 - u4, u3, u4, -u1 - u2)``. Their sum holds no torque: it is
-the angular momentum about the stance foot. So where a controller prescribes four accelerations,
+with the joint torques ``Q = (u1 - u3, u2 - u4, u3, u4, -u1 - u2)``. Their sum holds no torque: it
+is the angular momentum about the stance foot. So where a controller prescribes four accelerations,
 ``dda = alpha + beta z``, that one scalar equation gives ``z``, the others the torques, and no
 system has to be solved (`prescribed_motion`). Where torques are given, the inertia matrix is
 factorised (`free_motion`).
@@ -31,7 +31,8 @@ _RHS = 11
 
 # Cephes' polynomials on [-pi/4, pi/4] and pi/2 in three parts (Cody and Waite).
 _TWO_OVER_PI = 2.0 / math.pi
-_PIO2_1, _PIO2_2, _PIO2_3 = 1.57079625129699707031e0, 7.54978941586159635335e-8, 5.390302529957765e-15
+_PIO2_1, _PIO2_2 = 1.57079625129699707031e0, 7.54978941586159635335e-8
+_PIO2_3 = 5.390302529957765e-15
 _SIN = (
     1.58962301576546568060e-10,
     -2.50507477628578072866e-8,
