@@ -19,13 +19,14 @@ from biped_mfpt_msgs import msg
 from biped_mfpt_msgs.srv import SimulateSteps
 from builtin_interfaces.msg import Time
 
-from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES
+from biped_mfpt_ros.chain.markov import Metastability
+from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES, Mesh
 from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.step import Steps, check_states
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel, rabbit
-from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, check_slopes
+from biped_mfpt_ros.walker.terrain import check_slopes
 
 MESSAGE_BYTES = 1_000_000
 """Size at which published arrays are split: larger messages cost more time a byte."""
@@ -377,10 +378,43 @@ def transitions_messages(
         )
 
 
-def check_distribution(mu_s: float, sigma_s: Sequence[float]) -> None:
-    """Check mean and standard deviations of the slope, rad; raises InputError."""
-    if not abs(mu_s) <= SLOPE_LIMIT:
-        raise InputError("mu_s", mu_s, f"within {SLOPE_LIMIT:.4f} rad")
-    for i, sigma in enumerate(sigma_s):
-        if not (math.isfinite(sigma) and sigma > 0.0):
-            raise InputError(f"sigma_s[{i}]", sigma, "finite, > 0 rad")
+def estimate_message(
+    mesh_id: str,
+    controller: str,
+    mesh: Mesh,
+    mu_s: float,
+    sigma_s: float,
+    result: Metastability,
+    seconds: float,
+) -> msg.MfptEstimate:
+    """MFPT of a mesh as a message.
+
+    Parameters
+    ----------
+    mesh_id : str
+        The mesh that it comes from.
+    controller : str
+        Name of the controller.
+    mesh : Mesh
+        The mesh itself.
+    mu_s, sigma_s : float
+        rad, mean and standard deviation of the slope.
+    result : Metastability
+        What came out.
+    seconds : float
+        s, time to build and solve the chain.
+    """
+    shares = {int(code): float(share) for code, share in result.failure_shares.items()}
+    return msg.MfptEstimate(
+        mesh_id=mesh_id,
+        controller=controller,
+        mu_s=mu_s,
+        sigma_s=sigma_s,
+        mfpt=float(result.mfpt),
+        failure_probability=float(result.failure_probability),
+        lambda_2=float(result.lambda_2),
+        states=len(mesh.states),
+        failure_codes=packed(np.array(list(shares)), "B"),
+        failure_shares=packed(np.array(list(shares.values())), "d"),
+        seconds=seconds,
+    )

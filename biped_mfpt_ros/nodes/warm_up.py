@@ -16,15 +16,23 @@ class _Announcer(event.Listener):
     def __init__(self, log: Callable[[str], object], what: str) -> None:
         self._log = log
         self._what = what
-        self._said = False
+        self.said = False
 
     def on_start(self, event: event.Event) -> None:
-        if not self._said:
-            self._said = True
-            self._log(f"compiling {self._what}: this happens once and takes about 20 s")
+        if not self.said:
+            self.said = True
+            self._log(f"compiling {self._what}: this happens once on a machine")
 
     def on_end(self, event: event.Event) -> None:
         pass
+
+
+@contextmanager
+def announced(log: Callable[[str], object], what: str) -> Iterator[_Announcer]:
+    """Tell ``log`` when kernels begin to be compiled inside this."""
+    announcer = _Announcer(log, what)
+    with event.install_listener("numba:compile", announcer):
+        yield announcer
 
 
 @contextmanager
@@ -42,11 +50,10 @@ def compiled(log: Callable[[str], object], what: str) -> Iterator[None]:
     """
     directory = Path(numba.config.CACHE_DIR)
     directory.mkdir(parents=True, exist_ok=True)
-    announcer = _Announcer(log, what)
-    start = time.monotonic()
     with open(directory / "compiling.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with event.install_listener("numba:compile", announcer):
+        start = time.monotonic()
+        with announced(log, what) as announcer:
             yield
-    if announcer._said:
+    if announcer.said:
         log(f"compiled {what} in {time.monotonic() - start:.1f} s")

@@ -1,0 +1,252 @@
+"""The analysis: puts published meshes together and publishes their mean first-passage times."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from biped_mfpt_msgs.msg import MeshInfo, MeshStates, MeshTransitions, MfptEstimate
+from biped_mfpt_msgs.srv import ComputeMfpt
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.task import Future
+
+from biped_mfpt_ros.chain.markov import ChainError, metastability
+from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.nodes.assembly import IncompleteMesh, MeshAssembly
+from biped_mfpt_ros.nodes.messages import estimate_message, unpacked
+from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters, parameter
+from biped_mfpt_ros.nodes.publishers import CountedPublisher
+from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
+from biped_mfpt_ros.nodes.spin import run_node
+from biped_mfpt_ros.nodes.warm_up import compiled
+from biped_mfpt_ros.walker.robot import STATE_SIZE
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG
+
+_MOST_UNFINISHED = 64  # meshes being put together, before the oldest is given up
+_MOST_REASONS = 256  # remembered, why meshes cannot be used
+_MOST_SIGMAS = 10_000  # in one request
+_PATIENCE = 10.0  # s, for messages of a mesh that was closed
+
+
+@dataclass(frozen=True)
+class AnalysisParameters(NodeParameters):
+    """Parameters of the analysis."""
+
+    sigma_s_deg: tuple[float, ...] = parameter(
+        (1.0, 2.0), "degrees, standard deviations of the slope to publish MFPT for", 1e-3, 90.0
+    )
+    mu_s_deg: float = parameter(
+        0.0, "degrees, mean slope to publish MFPT for", -SLOPE_LIMIT_DEG, SLOPE_LIMIT_DEG
+    )
+    keep_meshes: int = parameter(4, "complete meshes kept for compute_mfpt", 1, 10_000)
+
+
+@dataclass(frozen=True)
+class _Known:
+    mesh: Mesh
+    controller: str
+
+
+def warm_up() -> None:
+    """Solve chains of one state, so that what solves them is compiled."""
+    slopes, outcomes = np.array([0.0, 0.1]), np.array([[NOT_SIMULATED] * 2, [0, 1]])
+    states = np.zeros((2, STATE_SIZE))
+    index = np.zeros(2, np.uint32)
+    mesh = Mesh(
+        slopes, states, index, index, [[0, 0], [1, 0]], outcomes, np.ones(STATE_SIZE), 1.0, True
+    )
+    # Where a slope has no probability at all, the arrays are others.
+    for sigma_s in (0.1, 1e-4):
+        metastability(mesh, 0.0, sigma_s)
+
+
+class Analysis(Node):
+    """Publishes `MfptEstimate` for every mesh, and serves `ComputeMfpt` for the last few.
+
+    Chains are built and solved in a thread of their own, so that no message has to wait.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("analysis")
+        self._parameters = Declared(self, AnalysisParameters)
+        with compiled(self.get_logger().info, "chain"):
+            warm_up()
+        self._estimates = CountedPublisher(self, MfptEstimate, "mfpt", RESULTS)
+        self._unfinished: dict[str, MeshAssembly] = {}
+        self._due: dict[str, float] = {}
+        self._finishing: set[str] = set()
+        self._known: dict[str, _Known] = {}
+        self._unusable: dict[str, str] = {}
+        self._lock = threading.Lock()
+        self._thread = ThreadPoolExecutor(1, "chain")
+        self.create_subscription(
+            MeshInfo, "mesh/info", lambda m: self._add(m, MeshAssembly.add_info), RESULTS
+        )
+        self.create_subscription(
+            MeshStates, "mesh/states", lambda m: self._add(m, MeshAssembly.add_states), RESULTS
+        )
+        self.create_subscription(
+            MeshTransitions,
+            "mesh/transitions",
+            lambda m: self._add(m, MeshAssembly.add_transitions),
+            RESULTS,
+        )
+        self.create_timer(1.0, self._give_up_overdue)
+        # Messages are to be taken, and requests answered, while another request is computed.
+        self.create_service(
+            ComputeMfpt,
+            "compute_mfpt",
+            self._compute,
+            qos_profile=REQUESTS,
+            callback_group=ReentrantCallbackGroup(),
+        )
+        self.get_logger().info("ready")
+
+    def close(self) -> None:
+        """Stop computing."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def _add(self, message: Any, add: Callable[[MeshAssembly, Any], None]) -> None:
+        mesh_id = message.mesh_id
+        if mesh_id in self._unusable or mesh_id in self._known or mesh_id in self._finishing:
+            return
+        assembly = self._unfinished.get(mesh_id)
+        if assembly is None:
+            assembly = self._unfinished[mesh_id] = MeshAssembly(mesh_id)
+            if len(self._unfinished) > _MOST_UNFINISHED:
+                oldest = next(iter(self._unfinished.values()))
+                self._give_up(
+                    oldest, f"{oldest.missing}; {_MOST_UNFINISHED} others were begun after it"
+                )
+        add(assembly, message)
+        if assembly.problem:
+            self._give_up(assembly, assembly.problem)
+        elif assembly.complete:
+            del self._unfinished[mesh_id]
+            self._due.pop(mesh_id, None)
+            self._finishing.add(mesh_id)
+            self._thread.submit(self._finish, assembly, self._parameters.now)
+        elif assembly.status == MeshInfo.COMPLETE:
+            self._due[mesh_id] = time.monotonic() + _PATIENCE
+
+    def _finish(self, assembly: MeshAssembly, parameters: AnalysisParameters) -> None:
+        """Put a mesh together and publish its estimates; in the thread of chains."""
+        mesh_id = assembly.mesh_id
+        try:
+            assert assembly.settings is not None
+            known = _Known(assembly.mesh(), assembly.settings.controller.name)
+            while len(self._known) >= parameters.keep_meshes:
+                oldest = next(iter(self._known))
+                self._remember(oldest, f"only the last {parameters.keep_meshes} are kept")
+                del self._known[oldest]
+            self._known[mesh_id] = known
+            mu_s = math.radians(parameters.mu_s_deg)
+            for sigma_deg in parameters.sigma_s_deg:
+                estimate = _estimate(mesh_id, known, mu_s, math.radians(sigma_deg))
+                self._estimates.publish(estimate)
+                self.get_logger().info(
+                    f"{mesh_id}: MFPT {estimate.mfpt:.6g} steps at sigma_s {sigma_deg:g} degrees"
+                )
+        except IncompleteMesh as error:
+            self._remember(mesh_id, str(error))
+            self.get_logger().error(str(error))
+        except (InputError, ChainError) as error:
+            self.get_logger().error(f"{mesh_id}: no MFPT: {error}")
+        except Exception:
+            if self.context.ok():
+                self.get_logger().error(f"{mesh_id}: no MFPT\n{traceback.format_exc()}")
+        self._finishing.discard(mesh_id)
+
+    def _give_up(self, assembly: MeshAssembly, reason: str) -> None:
+        del self._unfinished[assembly.mesh_id]
+        self._due.pop(assembly.mesh_id, None)
+        self._remember(assembly.mesh_id, reason)
+        log = self.get_logger()
+        ended = assembly.status in (MeshInfo.FAILED, MeshInfo.CANCELLED)
+        (log.info if ended else log.error)(f"mesh {assembly.mesh_id} cannot be used: {reason}")
+
+    def _remember(self, mesh_id: str, reason: str) -> None:
+        with self._lock:
+            self._unusable[mesh_id] = reason
+            if len(self._unusable) > _MOST_REASONS:
+                del self._unusable[next(iter(self._unusable))]
+
+    def _give_up_overdue(self) -> None:
+        for mesh_id, due in list(self._due.items()):
+            if time.monotonic() > due:
+                assembly = self._unfinished[mesh_id]
+                self._give_up(assembly, f"{assembly.missing}; messages were lost")
+
+    async def _compute(
+        self, request: ComputeMfpt.Request, response: ComputeMfpt.Response
+    ) -> ComputeMfpt.Response:
+        done: Future[None] = Future()
+
+        def compute() -> None:
+            self._fill(request, response)
+            done.set_result(None)
+            if self.executor is not None:
+                self.executor.wake()
+
+        self._thread.submit(compute)
+        await done
+        return response
+
+    def _fill(self, request: ComputeMfpt.Request, response: ComputeMfpt.Response) -> None:
+        """Answer a request; in the thread of chains. It is never left without an answer."""
+        estimates: list[MfptEstimate] = []
+        try:
+            mesh_id, known = self._find(request.mesh_id)
+            sigmas = unpacked(request.sigma_s, "d").tolist()
+            if not 1 <= len(sigmas) <= _MOST_SIGMAS:
+                raise InputError(
+                    "sigma_s", f"{len(sigmas)} numbers", f"1 to {_MOST_SIGMAS} numbers"
+                )
+            for i, sigma_s in enumerate(sigmas):
+                try:
+                    estimates.append(_estimate(mesh_id, known, request.mu_s, sigma_s))
+                except InputError as error:
+                    field = f"sigma_s[{i}]" if error.field == "sigma_s" else error.field
+                    raise InputError(field, error.value, error.allowed) from None
+            response.estimates = estimates
+            response.success = True
+        except InputError as error:
+            response.message = str(error)
+        except ChainError as error:
+            response.message = f"sigma_s[{len(estimates)}]: {error}"
+        except Exception as error:
+            self.get_logger().error(f"compute_mfpt failed\n{traceback.format_exc()}")
+            response.message = f"internal error of the analysis: {error!r}"
+
+    def _find(self, mesh_id: str) -> tuple[str, _Known]:
+        if not mesh_id and self._known:
+            mesh_id = next(reversed(self._known))
+        if mesh_id in self._known:
+            return mesh_id, self._known[mesh_id]
+        why = self._unusable.get(mesh_id, "")
+        if not why and mesh_id in self._unfinished:
+            why = self._unfinished[mesh_id].missing
+        complete = ", ".join(reversed(self._known)) or "none is complete yet"
+        allowed = f"a complete mesh: {complete}"
+        raise InputError("mesh_id", mesh_id, f"{allowed} (this one: {why})" if why else allowed)
+
+
+def _estimate(mesh_id: str, known: _Known, mu_s: float, sigma_s: float) -> MfptEstimate:
+    start = time.perf_counter()
+    result = metastability(known.mesh, mu_s, sigma_s)
+    seconds = time.perf_counter() - start
+    return estimate_message(mesh_id, known.controller, known.mesh, mu_s, sigma_s, result, seconds)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns the exit code."""
+    return run_node(Analysis, args)

@@ -1,0 +1,37 @@
+"""Publishing with what every message on our topics carries."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from biped_mfpt_ros.nodes.messages import stamp
+
+
+class CountedPublisher:
+    """Publisher that numbers its messages from 0 and stamps them; for one thread at a time.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Who publishes.
+    kind : type
+        Message with the fields ``sequence`` and ``stamp``.
+    topic : str
+        Relative name.
+    qos : rclpy.qos.QoSProfile
+        Quality of service.
+    """
+
+    def __init__(self, node: Node, kind: type[Any], topic: str, qos: QoSProfile) -> None:
+        self._publisher = node.create_publisher(kind, topic, qos)
+        self._sequence = 0
+
+    def publish(self, message: Any) -> None:
+        """Number, stamp and publish a message."""
+        message.sequence = self._sequence
+        message.stamp = stamp()
+        self._sequence += 1
+        self._publisher.publish(message)

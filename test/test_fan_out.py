@@ -1,0 +1,250 @@
+"""Chunks over simulators that fail in every way: the result is always the same, bit for bit."""
+
+import threading
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from biped_mfpt_msgs.srv import SimulateSteps
+
+from biped_mfpt_ros.gait.step import Steps
+from biped_mfpt_ros.nodes.fan_out import FanOut, FanOutSettings, NoSimulatorError
+from biped_mfpt_ros.nodes.messages import fill_response, packed, unpacked
+
+SLOPES = np.linspace(-0.2, 0.2, 7)
+QUICK = FanOutSettings(timeout=0.1, wait_seconds=0.5, chunk_seconds=1e-3)
+
+
+def step_map(states, previous):
+    """A stand-in for the step map: any pure function of each state will do."""
+    mixed = states.sum(axis=1, keepdims=True) * 1e3 + previous[:, None] + SLOPES
+    outcomes = (np.abs(mixed).astype(np.uint64) % 3).astype(np.uint8)
+    following = np.repeat(np.sin(states[:, None, :] + SLOPES[:, None]), 1, axis=0)
+    return outcomes, following[outcomes == 0]
+
+
+def right_answer(request):
+    states = unpacked(request.states, "d").reshape(-1, 10)
+    outcomes, following = step_map(states, unpacked(request.previous_slopes, "d"))
+    response = SimulateSteps.Response(step_map=request.step_map)
+    zeros = np.zeros(outcomes.shape)
+    fill_response(
+        response, Steps(outcomes, following, zeros, zeros, zeros, 1e-4 * len(states), 1, 7), False
+    )
+    return response
+
+
+class Fake:
+    """Simulators that answer from threads of their own, each in its own way."""
+
+    def __init__(self, **ways):
+        self.ways = ways
+        self.asked = dict.fromkeys(ways, 0)
+        self.dropped = {}
+
+    def found(self):
+        return [name for name in self.ways if name not in self.dropped]
+
+    def drop(self, name, reason):
+        self.dropped[name] = reason
+
+    def ask(self, name, request, answer):
+        self.asked[name] += 1
+        self.ways[name](self, request, answer)
+        return lambda: None
+
+
+def later(seconds, do):
+    timer = threading.Timer(seconds, do)
+    timer.daemon = True
+    timer.start()
+
+
+def good(fake, request, answer, delay=0.001):
+    later(delay, lambda: answer(right_answer(request)))
+
+
+def silent(fake, request, answer):
+    pass
+
+
+def twice(fake, request, answer):
+    good(fake, request, answer)
+    good(fake, request, answer, delay=0.004)
+
+
+def unreachable(fake, request, answer):
+    raise RuntimeError("no route")
+
+
+def spoiled(spoil, fake, request, answer):
+    response = right_answer(request)
+    spoil(response)
+    later(0.001, lambda: answer(response))
+
+
+def short(response):
+    response.outcomes = response.outcomes[:-1]
+
+
+def not_finite(response):
+    response.next_states = packed(np.full(len(response.next_states), np.nan), "d")
+
+
+def other_version(response):
+    response.step_map = "another"
+
+
+def refusing(response):
+    response.success = False
+    response.message = "no"
+
+
+@pytest.fixture
+def swings():
+    rng = np.random.default_rng(3)
+    return rng.normal(size=(300, 10)), rng.choice(SLOPES, 300)
+
+
+def fan_out(fake, settings=QUICK, log=None, tick=lambda: None):
+    request = SimulateSteps.Request(step_map="this", slopes=packed(SLOPES, "d"))
+    return FanOut(fake, request, settings, [].append if log is None else log.append, tick)
+
+
+def check(answers, swings):
+    outcomes, following = step_map(*swings)
+    assert answers.outcomes.tobytes() == outcomes.tobytes()
+    assert answers.next_states.tobytes() == following.tobytes()
+
+
+@pytest.mark.parametrize("simulators", [1, 2, 5])
+def test_all_simulators_are_used_and_answers_are_in_order(swings, simulators):
+    rng = np.random.default_rng(simulators)
+    fake = Fake(
+        **{f"s{i}": lambda *a: good(*a, delay=rng.uniform(0, 0.01)) for i in range(simulators)}
+    )
+    simulate = fan_out(fake)
+    check(simulate(*swings), swings)
+    check(simulate(swings[0][:1], swings[1][:1]), (swings[0][:1], swings[1][:1]))
+    assert all(fake.asked.values())
+    assert simulate.tally.swings == 301
+    assert simulate.tally.chunks_repeated == 0
+    assert simulate.tally.chunks == sum(fake.asked.values())
+    assert simulate.tally.step_map_seconds == pytest.approx(301e-4)
+    assert simulate.in_flight == 0
+
+
+@pytest.mark.parametrize(
+    ("way", "dropped", "said"),
+    [
+        (silent, False, "has not answered"),
+        (twice, False, ""),
+        (unreachable, True, "could not be asked"),
+        (partial(spoiled, short), True, "outcomes: 'length"),
+        (partial(spoiled, not_finite), True, "next_states: 'not finite'"),
+        (partial(spoiled, other_version), True, "runs step map another, not this"),
+        (partial(spoiled, refusing), True, "refuses: no (3 times in a row)"),
+    ],
+)
+def test_one_bad_simulator_beside_a_good_one(swings, way, dropped, said):
+    log = []
+    fake = Fake(bad=way, good=good)
+    simulate = fan_out(fake, log=log)
+    check(simulate(*swings), swings)
+    assert fake.asked["bad"]
+    assert (fake.dropped.keys() == {"bad"}) == dropped
+    assert said in "".join(log)
+    if dropped:
+        asked = fake.asked["bad"]
+        check(simulate(*swings), swings)
+        assert fake.asked["bad"] == asked
+    assert simulate.tally.swings == 300 * (1 + dropped)
+    assert (simulate.tally.chunks_repeated > 0) == (way is not twice)
+
+
+def test_a_simulator_that_goes_is_replaced_by_one_that_comes(swings):
+    fake = Fake(first=silent)
+
+    def exchange():
+        del fake.ways["first"]
+        fake.asked["second"] = 0
+        fake.ways["second"] = good
+
+    later(0.05, exchange)
+    log = []
+    simulate = fan_out(fake, log=log, settings=FanOutSettings(timeout=10.0, wait_seconds=1.0))
+    check(simulate(*swings), swings)
+    assert simulate.tally.chunks_repeated > 0
+    assert "first has gone with" in log[0]
+
+
+def test_a_late_simulator_is_used_again_once_it_answers(swings):
+    """Stopped for a while, as by SIGSTOP: all its answers come late, at once."""
+    start = time.monotonic()
+
+    def stopped(fake, request, answer):
+        good(fake, request, answer, delay=max(0.001, 0.4 - (time.monotonic() - start)))
+
+    def slow(fake, request, answer):
+        good(fake, request, answer, delay=0.05)
+
+    log = []
+    fake = Fake(stopped=stopped, slow=slow)
+    simulate = fan_out(fake, log=log)
+    for _ in range(4):
+        check(simulate(*swings), swings)
+    assert "stopped answers again" in log
+    # Many more than it was tried with while it was late.
+    assert fake.asked["stopped"] > 20
+    assert simulate.tally.swings == 4 * 300
+
+
+def test_a_lost_request_is_sent_again_even_to_the_only_simulator(swings):
+    lost = []
+
+    def loses_first(fake, request, answer):
+        if len(lost) < 3:
+            lost.append(request)
+        else:
+            good(fake, request, answer)
+
+    simulate = fan_out(Fake(only=loses_first), settings=FanOutSettings(timeout=0.1))
+    check(simulate(*swings), swings)
+
+
+def test_no_simulator_is_an_error_that_says_so(swings):
+    with pytest.raises(NoSimulatorError, match="none on the graph; start one with"):
+        fan_out(Fake())(*swings)
+
+
+def test_no_good_simulator_is_an_error_that_says_why(swings):
+    fake = Fake(bad=partial(spoiled, other_version), mute=silent)
+    with pytest.raises(NoSimulatorError, match="mute is late; bad, dropped, runs step map another"):
+        fan_out(fake)(*swings)
+
+
+def test_a_simulator_may_come_within_the_wait(swings):
+    fake = Fake()
+    fake.asked["late"] = 0
+    later(0.3, lambda: fake.ways.update(late=good))
+    check(fan_out(fake)(*swings), swings)
+
+
+def test_tick_ends_it_promptly(swings):
+    start = time.monotonic()
+
+    def tick():
+        if time.monotonic() - start > 0.1:
+            raise InterruptedError
+
+    forgotten = []
+    fake = Fake(mute=silent)
+    fake.ask = lambda name, request, answer: partial(forgotten.append, request)
+    simulate = fan_out(fake, settings=FanOutSettings(), tick=tick)
+    with pytest.raises(InterruptedError):
+        simulate(*swings)
+    assert time.monotonic() - start < 0.3
+    assert simulate.in_flight == FanOutSettings().in_flight
+    simulate.close()
+    assert len(forgotten) == FanOutSettings().in_flight
