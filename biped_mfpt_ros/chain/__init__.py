@@ -1,0 +1,1 @@
+"""From a step map to a mean first-passage time: the mesh, its search, and the Markov chain."""

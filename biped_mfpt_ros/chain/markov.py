@@ -1,0 +1,679 @@
+r"""Markov chain over a mesh, and the mean first-passage time to a fall (eq. 29 to 35).
+
+With P(s) the probability of slope s and rho the targets of the mesh, the chain steps from state i
+to rho(i, s) with probability P(s); 0 is the failure state. Q is T without that state, and
+f_i = sum of P(s) over the slopes on which i falls. lambda_2 is the largest eigenvalue of Q over
+the states that can be reached from x_2: the others belong to no walk. The metastable
+(quasi-stationary) distribution phi is its left eigenvector, phi Q = lambda_2 phi with sum 1.
+Summing that equation gives
+
+    1 - lambda_2 = sum of phi_i f_i,
+
+a sum of products that are not negative, so it is as accurate at 1e-100 as at 0.1. Nothing in this
+file subtracts a probability from one. It asks more of phi than a small norm of its error: falls
+may come from states with phi_i = 1e-20, so every component has to be right relative to itself.
+
+Iteration
+    phi is the limit of the distribution after k steps from x_2, given no fall so far. It is made
+    of sums of products that are not negative, and so accurate in every component. Every state
+    gets its weight by flow from x_2. A slow part of the chain shows: while it still fills, its
+    weight changes by 1/k or more in step k; after that, what is missing of it after k steps is
+    at most about k times what step k changed. Hence the rule to stop: k times the largest
+    relative change is within the tolerance. A state that lost weight to below what could matter
+    for the sum above is left out, but one that gains never is.
+
+Elimination
+    Chains that mix too slowly for that (walkers with several gaits and rare changes between
+    them), or that have a long period, are solved by elimination without subtractions [1]_ [2]_.
+    Rows of I - Q are kept as off-diagonals and row sums f_i, and a diagonal is the sum of these.
+
+References
+----------
+.. [1] W. K. Grassmann, M. I. Taksar, D. P. Heyman, "Regenerative analysis and steady state
+   distributions for Markov chains", Operations Research 33 (1985).
+.. [2] A. S. Alfa, J. Xue, Q. Ye, "Accurate computation of the smallest eigenvalue of a diagonally
+   dominant M-matrix", Mathematics of Computation 71 (2002).
+.. [3] T. Noda, "Note on the computation of the maximal eigenvalue of a non-negative irreducible
+   matrix", Numerische Mathematik 17 (1971).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from biped_mfpt_ros.chain.mesh import Mesh, check_transitions, checked_array
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.walker.terrain import check_slopes
+
+ELIMINATION_LIMIT = 2000
+"""Most states that are solved by elimination; time grows with the cube, memory with the square."""
+
+TOLERANCE = 1e-12
+"""Relative accuracy aimed at, in the MFPT and in every state's weight."""
+
+_PLAIN_STEPS = 100  # then steps with a share of staying, for periodic chains
+_STEPS = 3000
+# Weights below this may have lost digits to underflow, and are not waited for.
+_UNDERFLOW = 1e-290
+
+
+class ChainError(RuntimeError):
+    """The chain mixes too slowly to be iterated and is too large to be eliminated."""
+
+
+# Probabilities, transitions ---------------------------------------------------------------------
+
+
+def slope_probabilities(slopes: ArrayLike, mu_s: float, sigma_s: float) -> np.ndarray:
+    r"""Probabilities P_S of the slopes of a set (eq. 30, 31).
+
+    They are proportional to the normal density at the slopes and sum to 1. For equally spaced
+    slopes this is the trapezoidal rule for the expectation over s, which converges faster than any
+    power of the spacing d_s for a smooth integrand: the density's own error is about
+    :math:`2 \exp(-2 \pi^2 \sigma_s^2 / d_s^2)`, some 1e-34 for the paper's rule of thumb
+    d_s = sigma_s / 2, 5e-9 for d_s = sigma_s, and 1 % for d_s = 2 sigma_s. Where the integrand
+    jumps, at the slopes on which a state begins to fall, the rule cannot see closer than d_s. A
+    set that is too coarse for sigma_s is not rejected; with sigma_s far below d_s the nearest
+    slope gets all.
+
+    Slopes outside the set do not occur in the model. With a set to 20 degrees and sigma_s = 5
+    degrees they would have 6e-5 of the probability.
+
+    Parameters
+    ----------
+    slopes : array_like
+        S of eq. (24), rad, strictly ascending, shape (m,).
+    mu_s : float
+        Mean slope, rad, within the set.
+    sigma_s : float
+        Standard deviation of the slope, rad, above 0.
+
+    Returns
+    -------
+    numpy.ndarray
+        float64, shape (m,), sum 1. Each is right to about 1e-13 relative; those below 1e-308
+        become 0.
+
+    Raises
+    ------
+    InputError
+        If an argument is not allowed.
+    """
+    slopes = check_slopes(slopes)
+    if not (isinstance(mu_s, Real) and slopes[0] <= mu_s <= slopes[-1]):
+        raise InputError("mu_s", mu_s, f"{slopes[0]:.6g} to {slopes[-1]:.6g} rad, the slope set")
+    if not (isinstance(sigma_s, Real) and math.isfinite(sigma_s) and sigma_s > 0.0):
+        raise InputError("sigma_s", sigma_s, "a finite number above 0, rad")
+    with np.errstate(over="ignore"):
+        exponents = 0.5 * ((slopes - mu_s) / sigma_s) ** 2
+    # From the likeliest slope, so that a narrow density between two slopes does not vanish.
+    weights = np.exp(exponents.min() - exponents)
+    return weights / weights.sum()
+
+
+def transition_matrix(targets: ArrayLike, probabilities: ArrayLike) -> csr_array:
+    """Stochastic state-transition matrix T (eq. 32), the failure state included as index 0.
+
+    Parameters
+    ----------
+    targets : array_like
+        Eq. (27) as in `Mesh`, shape (n, m).
+    probabilities : array_like
+        P_S, shape (m,).
+
+    Returns
+    -------
+    scipy.sparse.csr_array
+        Shape (n, n), rows sum to 1 within rounding. Transitions of probability 0 are left out.
+    """
+    targets, probabilities = np.asarray(targets), np.asarray(probabilities)
+    n = len(targets)
+    columns = np.flatnonzero(probabilities)
+    indices = targets[1:, columns].ravel()
+    # The failure state is absorbing: one entry.
+    matrix = csr_array(
+        (
+            np.concatenate([[1.0], np.tile(probabilities[columns], n - 1)]),
+            np.concatenate([[0], indices]).astype(np.int64),
+            np.concatenate([[0], 1 + len(columns) * np.arange(n, dtype=np.int64)]),
+        ),
+        shape=(n, n),
+    )
+    matrix.sum_duplicates()
+    return matrix
+
+
+# One step of the chain, without a matrix --------------------------------------------------------
+
+
+@kernel
+def _step_forward(targets, probabilities, x, out):
+    """`out` = x T for a distribution x; what falls goes to out[0]. x[0] does not count."""
+    out[:] = 0.0
+    for i in range(1, targets.shape[0]):
+        weight = x[i]
+        if weight > 0.0:
+            for s in range(targets.shape[1]):
+                out[targets[i, s]] += weight * probabilities[s]
+
+
+@kernel
+def _step_backward(targets, probabilities, x, out):
+    """`out` = T x for a function x of the state, with 0 for the failure state."""
+    out[0] = 0.0
+    for i in range(1, targets.shape[0]):
+        total = 0.0
+        for s in range(targets.shape[1]):
+            if targets[i, s] != 0:
+                total += probabilities[s] * x[targets[i, s]]
+        out[i] = total
+
+
+@kernel
+def _settle(x, out, stay, floor):
+    """Write out[1:] + stay * x[1:], scaled to sum 1, to x; return the largest relative change.
+
+    Components that shrink and are below `floor` do not count.
+    """
+    total = 0.0
+    for i in range(1, x.shape[0]):
+        out[i] += stay * x[i]
+        total += out[i]
+    largest = 0.0
+    for i in range(1, x.shape[0]):
+        value = out[i] / total
+        change = value - x[i]
+        if value > _UNDERFLOW and (change > 0.0 or value > floor):
+            largest = max(largest, abs(change) / value)
+        x[i] = value
+    return largest
+
+
+@kernel
+def _weight_by_outcome(targets, outcomes, probabilities, x, out):
+    """out[code] = probability that a step from distribution x falls with that outcome code."""
+    for i in range(1, targets.shape[0]):
+        if x[i] > 0.0:
+            for s in range(targets.shape[1]):
+                if targets[i, s] == 0:
+                    out[outcomes[i, s]] += x[i] * probabilities[s]
+
+
+# Who can reach whom -----------------------------------------------------------------------------
+
+
+@kernel
+def _reachable(targets, start, out, queue):
+    """Mark in `out` the states that can be reached from `start`, itself included."""
+    out[start] = True
+    queue[0] = start
+    waiting = 1
+    while waiting > 0:
+        waiting -= 1
+        i = queue[waiting]
+        for s in range(targets.shape[1]):
+            j = targets[i, s]
+            if not out[j]:
+                out[j] = True
+                queue[waiting] = j
+                waiting += 1
+
+
+@kernel
+def _can_reach(targets, out):
+    """Mark in `out` also the states from which one can reach those already marked."""
+    changed = True
+    while changed:
+        changed = False
+        for i in range(targets.shape[0] - 1, 0, -1):
+            if not out[i]:
+                for s in range(targets.shape[1]):
+                    if out[targets[i, s]]:
+                        out[i] = True
+                        changed = True
+                        break
+
+
+# Elimination ------------------------------------------------------------------------------------
+
+
+@kernel
+def _eliminate(q, slack, pivots, least):
+    """Factor I - Q, with row sums `slack`, in place and without subtracting; states k-1 to 0.
+
+    The diagonal of `q` is not used. Then q[i, p] for i < p are the multipliers, q[p, j] for j < p
+    the rest of row p when its turn came, and `pivots` the diagonal, at least `least`.
+    """
+    for p in range(q.shape[0] - 1, -1, -1):
+        pivot = slack[p]
+        for j in range(p):
+            pivot += q[p, j]
+        pivots[p] = max(pivot, least)
+        for i in range(p):
+            if q[i, p] != 0.0:
+                q[i, p] /= pivots[p]
+                factor = q[i, p]
+                slack[i] += factor * slack[p]
+                for j in range(p):
+                    q[i, j] += factor * q[p, j]
+
+
+@kernel
+def _solve_left(q, pivots, x):
+    """Replace x by x (I - Q)^-1, from what `_eliminate` left."""
+    for p in range(q.shape[0] - 1, -1, -1):
+        x[p] /= pivots[p]
+        for j in range(p):
+            x[j] += x[p] * q[p, j]
+    for p in range(1, q.shape[0]):
+        for i in range(p):
+            x[p] += x[i] * q[i, p]
+
+
+@kernel
+def _solve_right(q, pivots, x):
+    """Replace x by (I - Q)^-1 x, from what `_eliminate` left."""
+    for p in range(q.shape[0] - 1, 0, -1):
+        for i in range(p):
+            x[i] += q[i, p] * x[p]
+    for p in range(q.shape[0]):
+        for j in range(p):
+            x[p] += q[p, j] * x[j]
+        x[p] /= pivots[p]
+
+
+def _check_size(states: int, why: str) -> None:
+    if states > ELIMINATION_LIMIT:
+        raise ChainError(
+            f"the chain does not settle in {_STEPS} steps, and {why} of {states} states is too "
+            f"large to be eliminated (limit {ELIMINATION_LIMIT})"
+        )
+
+
+def _escape(q: np.ndarray, slack: np.ndarray) -> tuple[float, np.ndarray]:
+    """Escape rate 1 - lambda and left Perron vector of an irreducible Q, by Noda's iteration [3]_.
+
+    While the shift is below the escape rate, (I - Q - shift)^-1 has no negative entry, and a step
+    from x to y = x (I - Q - shift)^-1 encloses the rate between the shift plus the least and the
+    shift plus the largest x_i / y_i. The lower bound is the next shift. Taking the shift off the
+    row sums is the only subtraction; its rounding disturbs the vector no more than an error of the
+    same relative size in the row sums does.
+    """
+    k = len(q)
+    pivots = np.empty(k)
+    if not slack.any():
+        # No escape. With one from state 0, the visits between two of them are stationary.
+        factors = q.copy()
+        _eliminate(factors, slack.copy(), pivots, 1e-300)
+        pivots[0] = 1.0
+        x = np.zeros(k)
+        x[0] = 1.0
+        _solve_left(factors, pivots, x)
+        return 0.0, x / x.sum()
+    shift = 0.0
+    x = np.full(k, 1.0 / k)
+    for _ in range(100):
+        factors = q.copy()
+        # A shift that is the rate itself to the last digit may leave a last pivot of 0 or below.
+        _eliminate(factors, slack - shift, pivots, max(1e-16 * shift, 1e-290))
+        # A factorisation costs as much as very many solves, but those may converge slowly.
+        for _ in range(20):
+            y = x.copy()
+            _solve_left(factors, pivots, y)
+            counts = x > _UNDERFLOW
+            ratios = x[counts] / y[counts]
+            low, high = shift + ratios.min(), shift + ratios.max()
+            x = y / y.sum()
+            if high - low <= TOLERANCE * high:
+                return 0.5 * (low + high), x
+        shift = low
+    raise ChainError(f"the escape rate of {k} states stays between {low:.15g} and {high:.15g}")
+
+
+def _eliminated_distribution(
+    targets: np.ndarray, probabilities: np.ndarray, start: int
+) -> np.ndarray:
+    """Metastable distribution by elimination, class by class of states that reach each other.
+
+    lambda_2 is the largest of the classes' eigenvalues. Its left eigenvector is 0 on states that
+    the class cannot be left for, the class's own Perron vector in it, and follows from that on
+    the states further down.
+    """
+    n = len(targets)
+    matrix = transition_matrix(targets, probabilities)
+    reached = np.flatnonzero(_mark_reachable(targets, start))
+    reached = reached[reached != 0]
+    _, labels = connected_components(matrix[reached][:, reached], connection="strong")
+    _check_size(int(np.bincount(labels).max()), "a class")
+    label_of = np.full(n, -1)
+    label_of[reached] = labels
+    entries = matrix.tocoo()
+    rows, columns = entries.coords
+    leaves = label_of[rows] != label_of[columns]
+    outflow = np.bincount(rows[leaves], entries.data[leaves], minlength=n)
+
+    by_label = reached[np.argsort(labels, kind="stable")]
+    classes = np.split(by_label, np.cumsum(np.bincount(labels))[:-1])
+    vectors = []
+    keys = []
+    for members in classes:
+        block = matrix[members][:, members].toarray()
+        rate, vector = _escape(block, outflow[members])
+        vectors.append(vector)
+        # Near 1 the rates no longer tell small eigenvalues apart; what stays does.
+        keys.append((rate, -float((vector @ block).sum())))
+    best = min(range(len(classes)), key=keys.__getitem__)
+    while True:
+        below = _mark_reachable(targets, int(classes[best][0]))
+        below[0] = False
+        below[classes[best]] = False
+        # Of equal classes one behind the other, the last one keeps all the weight.
+        ties = [c for c, key in enumerate(keys) if key == keys[best] and below[classes[c][0]]]
+        if not ties:
+            break
+        best = ties[0]
+
+    x = np.zeros(n)
+    x[classes[best]] = vectors[best]
+    rest = np.flatnonzero(below)
+    if len(rest):
+        _check_size(len(rest), "the part behind the slowest class")
+        rate = keys[best][0]
+        factors, pivots = matrix[rest][:, rest].toarray(), np.empty(len(rest))
+        slack = matrix[rest][:, [0]].toarray().ravel() - rate
+        _eliminate(factors, slack, pivots, max(1e-16 * rate, 1e-290))
+        inflow = vectors[best] @ matrix[classes[best]][:, rest]
+        _solve_left(factors, pivots, inflow)
+        x[rest] = inflow
+    return x / x.sum()
+
+
+def _eliminated_times(
+    targets: np.ndarray, probabilities: np.ndarray, among: np.ndarray
+) -> np.ndarray:
+    """Mean first-passage times of the states `among`, which lead only to each other and to 0."""
+    members = np.flatnonzero(among)
+    _check_size(len(members), "a part")
+    rows = transition_matrix(targets, probabilities)[members]
+    factors, pivots = rows[:, members].toarray(), np.empty(len(members))
+    _eliminate(factors, rows[:, [0]].toarray().ravel(), pivots, 1e-300)
+    times = np.ones(len(members))
+    _solve_right(factors, pivots, times)
+    out = np.zeros(len(targets))
+    out[members] = times
+    return out
+
+
+# Iteration --------------------------------------------------------------------------------------
+
+
+def _mark_reachable(targets: np.ndarray, start: int) -> np.ndarray:
+    out = np.zeros(len(targets), dtype=np.bool_)
+    _reachable(targets, start, out, np.empty(len(targets), dtype=np.int64))
+    return out
+
+
+Step = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]
+Floor = Callable[[np.ndarray, float], float]
+
+
+def _iterate(
+    step: Step, targets: np.ndarray, probabilities: np.ndarray, start: int, floor: Floor
+) -> np.ndarray | None:
+    """Repeat a step from `start`, scaled to sum 1, until it settles; None if it does not.
+
+    ``floor(out, total)`` is the size below which a component that shrinks does not matter, from
+    what a step gave and its sum without out[0]. Returns the last non-zero vector where a step
+    leaves nothing (lambda_2 = 0).
+    """
+    x, out = np.zeros(len(targets)), np.empty(len(targets))
+    x[start] = 1.0
+    previous = math.inf
+    for k in range(1, _STEPS + 1):
+        step(targets, probabilities, x, out)
+        total = float(out[1:].sum())
+        if total == 0.0:
+            return x
+        stay = 0.0 if k <= _PLAIN_STEPS else 0.5 * total
+        change = _settle(x, out, stay, floor(out, total))
+        # Two in a row, as parts that oscillate may stand still for a moment.
+        if k * max(change, previous) <= TOLERANCE:
+            return x
+        previous = change
+    return None
+
+
+def _iterated_times(
+    targets: np.ndarray,
+    probabilities: np.ndarray,
+    among: np.ndarray,
+    phi: np.ndarray,
+    escape: float,
+) -> np.ndarray | None:
+    """Mean first-passage times m of the states `among`; None if iteration does not settle.
+
+    m = (I - Q)^-1 1 is split with the right eigenvector psi of lambda_2, phi psi = 1: what starts
+    in state i is worth psi_i of the metastable distribution, hence
+
+        m = psi / (1 - lambda_2) + sum over k of Q^k (1 - psi),
+
+    where phi (1 - psi) = 0, so the series forgets as fast as the chain does and is of the size
+    of that time, however large the first term. psi comes from the likeliest state just as phi
+    does from x_2. With `escape` 0 all is in the series.
+    """
+    n = len(targets)
+    psi = np.zeros(n)
+    if escape > 0.0:
+        likeliest = int(np.argmax(phi))
+
+        def floor(out: np.ndarray, total: float) -> float:
+            # Below this, psi / escape is within the tolerance of the first step alone.
+            return TOLERANCE * escape * float(phi @ out) / total
+
+        found = _iterate(_step_backward, targets, probabilities, likeliest, floor)
+        if found is None:
+            return None
+        if phi @ found > 0.0:
+            psi = found / (phi @ found)
+    rest = np.where(among, 1.0 - psi, 0.0)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        first = np.where(psi > 0.0, psi / escape, 0.0)
+    series = np.zeros(n)
+    out = np.empty(n)
+    for k in range(1, _STEPS + 1):
+        largest = float(np.max(np.abs(rest) / np.maximum(first + series, 1.0)))
+        if k * largest <= TOLERANCE:
+            return first + series
+        _step_backward(targets, probabilities, rest, out)
+        if k <= _PLAIN_STEPS:
+            series += rest
+            rest, out = out, rest
+        else:
+            # (I - Q)^-1 = (I - (I + Q) / 2)^-1 / 2
+            series += 0.5 * rest
+            rest = 0.5 * (rest + out)
+        # phi rest = 0 but for rounding, which would stay for ever.
+        rest -= psi * (phi @ rest)
+    return None
+
+
+# Results ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Metastability:
+    """What a chain over a mesh says about falls. n states, the failure state counted as index 0.
+
+    Parameters
+    ----------
+    lambda_2 : float
+        Second largest eigenvalue of T: probability of surviving a step, once metastable. Summed
+        up from what survives, so accurate near 0; near 1 use `failure_probability`.
+    failure_probability : float
+        1 - lambda_2, summed up from what falls, accurate relative to itself.
+    mfpt : float
+        Mean first-passage time, steps, eq. (35): 1 / (1 - lambda_2); inf where a state can be
+        reached from x_2 from which no fall can be reached. Above 1e280 digits are lost to
+        underflow.
+    distribution : numpy.ndarray
+        Metastable distribution phi, shape (n,), sum 1, index 0 is 0. It has no weight on states
+        that are not visited again and again. Where lambda_2 is 0 it is one from which every
+        step falls; where no fall can be reached from some states, it is stationary on those.
+        Weights below about 1e-12 (1 - lambda_2) / n may be off: they do not matter for falls.
+    failure_shares : dict of int to float
+        Share of each outcome code in the falls from the metastable distribution, ascending code,
+        codes without share left out; sums to 1. Empty if there are no falls.
+    """
+
+    lambda_2: float
+    failure_probability: float
+    mfpt: float
+    distribution: np.ndarray
+    failure_shares: dict[int, float]
+    _targets: np.ndarray = field(repr=False)
+    _probabilities: np.ndarray = field(repr=False)
+
+    @cached_property
+    def mfpt_from_state(self) -> np.ndarray:
+        """Mean number of steps to a fall from each state, the falling one counted; shape (n,).
+
+        Computed when first asked for, at about twice the cost of the rest. 0 for the failure
+        state, inf for states from which one can reach some that never fall. Accurate relative
+        to itself at any size.
+
+        Raises
+        ------
+        ChainError
+            If the chain mixes too slowly to be iterated and is too large to be eliminated.
+        """
+        targets, probabilities = self._targets, self._probabilities
+        endless = ~_mark_can_fall(targets)
+        _can_reach(targets, endless)
+        among = ~endless
+        among[0] = False
+        escape = 0.0 if endless.any() else self.failure_probability
+        times = _iterated_times(targets, probabilities, among, self.distribution, escape)
+        if times is None:
+            times = _eliminated_times(targets, probabilities, among)
+        times[endless] = math.inf
+        times.flags.writeable = False
+        return times
+
+
+def _mark_can_fall(targets: np.ndarray) -> np.ndarray:
+    out = np.zeros(len(targets), dtype=np.bool_)
+    out[0] = True
+    _can_reach(targets, out)
+    return out
+
+
+def _solve(targets: np.ndarray, outcomes: np.ndarray, probabilities: np.ndarray) -> Metastability:
+    possible = probabilities > 0.0
+    if not possible.all():
+        targets, outcomes = targets[:, possible], outcomes[:, possible]
+        probabilities = probabilities[possible]
+    targets, outcomes = np.ascontiguousarray(targets), np.ascontiguousarray(outcomes)
+    n = len(targets)
+
+    start = 1
+    can_fall = _mark_can_fall(targets)
+    endless = False
+    if not can_fall.all():
+        safe = _mark_reachable(targets, 1) & ~can_fall
+        if safe.any():
+            start = int(np.argmax(safe))
+            endless = True
+
+    def floor(out: np.ndarray, total: float) -> float:
+        return TOLERANCE / n * (1.0 if endless else float(out[0]) / (float(out[0]) + total))
+
+    phi = _iterate(_step_forward, targets, probabilities, start, floor)
+    if phi is None:
+        phi = _eliminated_distribution(targets, probabilities, start)
+    phi.flags.writeable = False
+
+    out = np.empty(n)
+    _step_forward(targets, probabilities, phi, out)
+    by_code = np.zeros(256)
+    _weight_by_outcome(targets, outcomes, probabilities, phi, by_code)
+    survives, falls = float(out[1:].sum()), float(by_code.sum())
+    escape = falls / (survives + falls)
+    return Metastability(
+        lambda_2=survives / (survives + falls),
+        failure_probability=escape,
+        mfpt=1.0 / escape if escape > 0.0 else math.inf,
+        distribution=phi,
+        failure_shares={int(code): float(by_code[code] / falls) for code in by_code.nonzero()[0]},
+        _targets=targets,
+        _probabilities=probabilities,
+    )
+
+
+def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
+    """Metastability of the chain over a mesh for normally distributed slopes (eq. 30 to 35).
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The mesh; one serves any number of distributions.
+    mu_s : float
+        Mean slope, rad, within the slope set.
+    sigma_s : float
+        Standard deviation of the slope, rad, above 0. The slope set should not be much coarser,
+        see `slope_probabilities`.
+
+    Returns
+    -------
+    Metastability
+
+    Raises
+    ------
+    InputError
+        If mu_s or sigma_s is not allowed.
+    ChainError
+        If the chain mixes too slowly to be iterated and is too large to be eliminated.
+    """
+    return _solve(mesh.targets, mesh.outcomes, slope_probabilities(mesh.slopes, mu_s, sigma_s))
+
+
+def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLike) -> Metastability:
+    """Metastability of a chain given by its arrays, for any distribution of slopes.
+
+    Parameters
+    ----------
+    targets, outcomes : array_like
+        As in `Mesh`, shape (n, m). The walk starts in state 1.
+    probabilities : array_like
+        P_S, not negative, sum 1, shape (m,).
+
+    Returns
+    -------
+    Metastability
+
+    Raises
+    ------
+    InputError
+        If an argument is not allowed.
+    ChainError
+        If the chain mixes too slowly to be iterated and is too large to be eliminated.
+    """
+    shape = np.shape(targets)
+    if len(shape) != 2 or shape[0] < 2 or shape[1] < 1:
+        raise InputError("targets", shape, "an array of shape (n, m), n at least 2, m at least 1")
+    targets = checked_array("targets", targets, np.uint32, shape)
+    outcomes = checked_array("outcomes", outcomes, np.uint8, shape)
+    probabilities = checked_array("probabilities", probabilities, np.float64, shape[1:])
+    check_transitions(targets, outcomes)
+    if not ((probabilities >= 0.0).all() and abs(probabilities.sum() - 1.0) <= 1e-12):
+        raise InputError("probabilities", probabilities.tolist(), "not negative, with sum 1")
+    return _solve(targets, outcomes, probabilities)

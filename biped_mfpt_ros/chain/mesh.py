@@ -1,0 +1,398 @@
+"""Meshing of the reachable states (Algorithm 1, eq. 24 to 28).
+
+The mesh is grown generation by generation: all unexplored states are simulated at once for every
+slope, and their successors are tested one after another, in the order of their parents and then
+of the slopes. What comes out depends on the answers of the step map alone, not on who computed
+them, in how many pieces, or when. So a mesh is resumed by growing it again with a `simulate` that
+takes what was recorded from the record and simulates only the rest.
+
+The paper leaves open when the scales r_i of eq. (25) are refreshed. Here:
+
+- r_i is the standard deviation of dimension i over the states of X, x_1 left out, at the start of
+  each generation's tests. It stays the same while one generation is tested.
+- A dimension in which X has no spread beyond rounding takes the standard deviation over the
+  successors that are about to be tested. The first generation, where X is x_2 alone, gets all
+  its scales this way.
+- A dimension in which these have no spread either gets r_i = inf: it says nothing about how far
+  apart two states are, and its term of eq. (25) is 0.
+
+The last generation adds no state, so its scales are those of the final X, and they decide the
+targets of eq. (27).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from numbers import Integral, Real
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
+
+from biped_mfpt_ros.chain.nearest import STATE_SIZE, StateSet
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.walker.outcome import Outcome
+from biped_mfpt_ros.walker.terrain import check_slopes
+
+NOT_SIMULATED = 255
+"""What stands for the outcomes of the failure state, from which no step is taken."""
+
+DEFAULT_MAX_STATES = 100_000
+"""Default limit on the states of a mesh."""
+
+# Relative to the largest value of a dimension. Rounding in a step leaves some 1e-16 to 1e-14, and
+# the step map is good to 1e-6 or so: nothing that is still to be told apart lies below.
+_ROUNDING = 1e-12
+
+
+class MeshLimitError(RuntimeError):
+    """A mesh would hold more states than allowed.
+
+    Parameters
+    ----------
+    max_states : int
+        Most states allowed, the failure state counted.
+    generation : int
+        Generation that was being added.
+    explored : int
+        States that had been simulated.
+    threshold : float
+        d_thr of the mesh.
+    """
+
+    def __init__(self, max_states: int, generation: int, explored: int, threshold: float) -> None:
+        self.max_states = max_states
+        self.generation = generation
+        self.explored = explored
+        self.threshold = threshold
+        super().__init__(
+            f"the mesh would hold more than max_states = {max_states} states, in generation "
+            f"{generation}, after {explored} states were simulated; allow more states or a "
+            f"threshold above {threshold:g}"
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.max_states, self.generation, self.explored, self.threshold)
+
+
+class Steps(Protocol):
+    """What `grow_mesh` needs of the answer to n states and m slopes."""
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """`Outcome` codes, uint8, shape (n, m)."""
+
+    @property
+    def next_states(self) -> np.ndarray:
+        """States after the k steps with outcome STEP, in row-major order of them, (k, 10)."""
+
+
+Simulate = Callable[[np.ndarray, np.ndarray], Steps]
+OnGeneration = Callable[[int, int, np.ndarray, np.ndarray], object]
+
+
+def checked_array(
+    field: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Check the shape, and that the values survive the cast; return an array of that dtype.
+
+    Raises
+    ------
+    InputError
+        If one of these does not hold.
+    """
+    try:
+        given = np.asarray(value)
+        with np.errstate(invalid="ignore"):
+            out = np.ascontiguousarray(given, dtype=dtype).reshape(given.shape)
+    except (TypeError, ValueError):
+        raise InputError(field, value, f"an array of numbers of shape {shape}") from None
+    if given.shape != shape:
+        raise InputError(field, given.shape, f"an array of shape {shape}")
+    # NaN is left to the caller: it survives a cast to float, and no other.
+    changed = (out != given) & ~(np.isnan(out) & np.isnan(given))
+    if changed.any():
+        raise InputError(field, given[changed][0].item(), f"values that {out.dtype} can hold")
+    return out
+
+
+def _check_finite(field: str, value: np.ndarray, allowed: str = "finite numbers") -> None:
+    bad = ~np.isfinite(value)
+    if bad.any():
+        raise InputError(field, float(value[bad][0]), allowed)
+
+
+def _check_threshold(threshold: float) -> float:
+    if not (isinstance(threshold, Real) and math.isfinite(threshold) and threshold > 0.0):
+        raise InputError("threshold", threshold, "a finite number above 0")
+    return float(threshold)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Set of states X and state-transition map of a controller. Index 0 is the failure state x_1.
+
+    The arrays are checked and made read-only. n counts the failure state.
+
+    Parameters
+    ----------
+    slopes : numpy.ndarray
+        S of eq. (24), rad, strictly ascending, float64, shape (m,).
+    states : numpy.ndarray
+        X: q1..q5 (rad), dq1..dq5 (rad/s), float64, shape (n, 10). Row 0 is all zeros and stands
+        for every fallen state; index 1 is x_2.
+    preceding : numpy.ndarray
+        Index into `slopes` of the slope that precedes each state, uint32, shape (n,).
+    generation : numpy.ndarray
+        Generation that added each state, 0 for x_2, uint32, shape (n,).
+    targets : numpy.ndarray
+        Eq. (27): index of the state after a step from state i on slope s, 0 for a fall; uint32,
+        shape (n, m). Row 0 is all zeros.
+    outcomes : numpy.ndarray
+        `Outcome` codes of these steps, uint8, shape (n, m). Row 0 is all `NOT_SIMULATED`.
+    scales : numpy.ndarray
+        r_i of eq. (25) for the final X, rad and rad/s, shape (10,); inf for a dimension that
+        does not count.
+    threshold : float
+        d_thr of Algorithm 1.
+    clustered : bool
+        Whether distances were taken only to states of the same preceding slope.
+
+    Raises
+    ------
+    InputError
+        If an array has the wrong shape or values that cannot be.
+    """
+
+    slopes: np.ndarray
+    states: np.ndarray
+    preceding: np.ndarray
+    generation: np.ndarray
+    targets: np.ndarray
+    outcomes: np.ndarray
+    scales: np.ndarray
+    threshold: float
+    clustered: bool
+
+    def __post_init__(self) -> None:
+        slopes = check_slopes(self.slopes)
+        n, m = len(np.atleast_1d(self.states)), len(slopes)
+        if n < 2:
+            raise InputError("states", n, "at least the failure state and x_2")
+        states = checked_array("states", self.states, np.float64, (n, STATE_SIZE))
+        preceding = checked_array("preceding", self.preceding, np.uint32, (n,))
+        generation = checked_array("generation", self.generation, np.uint32, (n,))
+        targets = checked_array("targets", self.targets, np.uint32, (n, m))
+        outcomes = checked_array("outcomes", self.outcomes, np.uint8, (n, m))
+        scales = checked_array("scales", self.scales, np.float64, (STATE_SIZE,))
+        _check_finite("states", states)
+        if preceding.max() >= m:
+            raise InputError("preceding", int(preceding.max()), f"indices of slopes, below {m}")
+        check_transitions(targets, outcomes)
+        if not (scales > 0.0).all():
+            raise InputError("scales", scales.tolist(), "numbers above 0, or inf")
+        checked = {
+            "slopes": slopes,
+            "states": states,
+            "preceding": preceding,
+            "generation": generation,
+            "targets": targets,
+            "outcomes": outcomes,
+            "scales": scales,
+            "threshold": _check_threshold(self.threshold),
+            "clustered": bool(self.clustered),
+        }
+        for field in fields(self):
+            value = checked[field.name]
+            if isinstance(value, np.ndarray):
+                value = value.view()
+                value.flags.writeable = False
+            object.__setattr__(self, field.name, value)
+
+
+def check_transitions(targets: np.ndarray, outcomes: np.ndarray) -> None:
+    """Check that targets and outcomes, of equal shape (n, m), go together.
+
+    Raises
+    ------
+    InputError
+        If a target is not a state, a step that succeeded has target 0 or one that did not has
+        another, or row 0 is not that of the failure state.
+    """
+    n = len(targets)
+    if targets.max(initial=0) >= n:
+        raise InputError("targets", int(targets.max()), f"indices of states, below {n}")
+    if targets[0].any() or (outcomes[0] != NOT_SIMULATED).any():
+        raise InputError(
+            "targets[0], outcomes[0]",
+            (targets[0].tolist(), outcomes[0].tolist()),
+            f"all 0 and all {NOT_SIMULATED}: the failure state takes no step",
+        )
+    wrong = (targets[1:] == 0) == (outcomes[1:] == Outcome.STEP)
+    if wrong.any():
+        i, s = np.argwhere(wrong)[0]
+        raise InputError(
+            f"targets[{i + 1}, {s}], outcomes[{i + 1}, {s}]",
+            (int(targets[i + 1, s]), int(outcomes[i + 1, s])),
+            "target 0 for a fall, outcome 0 (STEP) with any other target",
+        )
+
+
+def _slope_index(slopes: np.ndarray, slope: float, field: str) -> int:
+    if not (isinstance(slope, Real) and math.isfinite(slope)):
+        raise InputError(field, slope, "a slope of the set, rad")
+    nearest = int(np.argmin(np.abs(slopes - slope)))
+    # Degrees converted in another way may differ in the last digits.
+    if abs(slopes[nearest] - slope) > 1e-12:
+        raise InputError(
+            field, slope, f"a slope of the set; the nearest is {slopes[nearest]:.6g} rad"
+        )
+    return nearest
+
+
+def _spread(states: np.ndarray) -> np.ndarray:
+    """Standard deviation of each dimension, exactly 0 where it is rounding only; shape (10,)."""
+    if len(states) == 0:
+        return np.zeros(STATE_SIZE)
+    # Taken from the first state, a constant dimension is exactly 0 and a narrow one loses nothing.
+    deviation = np.std(states - states[0], axis=0)
+    largest = np.maximum(states.max(axis=0), -states.min(axis=0))
+    return np.where(deviation > _ROUNDING * largest, deviation, 0.0)
+
+
+def _scales(states: np.ndarray, successors: np.ndarray) -> np.ndarray:
+    """Scales r_i of eq. (25) by the rules at the top of this file; shape (10,)."""
+    spread = _spread(states)
+    if not spread.all():
+        spread = np.where(spread > 0.0, spread, _spread(successors))
+    return np.where(spread > 0.0, spread, np.inf)
+
+
+def _check_steps(steps: Steps, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    outcomes = checked_array("outcomes", steps.outcomes, np.uint8, (n, m))
+    succeeded = int(np.count_nonzero(outcomes == Outcome.STEP))
+    successors = checked_array(
+        "next_states", steps.next_states, np.float64, (succeeded, STATE_SIZE)
+    )
+    _check_finite("next_states", successors, "finite states after every step that succeeded")
+    if (outcomes == NOT_SIMULATED).any():
+        raise InputError("outcomes", NOT_SIMULATED, "outcome codes of steps")
+    return outcomes, successors
+
+
+def grow_mesh(
+    simulate: Simulate,
+    initial_state: ArrayLike,
+    slopes: ArrayLike,
+    threshold: float,
+    *,
+    initial_slope: float = 0.0,
+    clustered: bool = True,
+    max_states: int = DEFAULT_MAX_STATES,
+    on_generation: OnGeneration | None = None,
+) -> Mesh:
+    """Mesh the states that a controller can reach (Algorithm 1).
+
+    Parameters
+    ----------
+    simulate : callable
+        ``simulate(states, previous_slopes)`` takes one generation, float64 of shape (n, 10) and
+        rad of shape (n,), and returns an object with ``outcomes`` and ``next_states`` as in
+        `Steps`. The answer for a state must not depend on the states beside it.
+    initial_state : array_like
+        x_2, a state in the basin of attraction: q1..q5 (rad), dq1..dq5 (rad/s), shape (10,).
+    slopes : array_like
+        S of eq. (24), rad, strictly ascending, shape (m,).
+    threshold : float
+        d_thr, dimensionless, above 0: a state is new if eq. (25) gives more than this.
+    initial_slope : float, optional
+        Slope that precedes x_2, rad, one of `slopes`.
+    clustered : bool, optional
+        Take distances only to states of the same preceding slope (default), or to all states. A
+        successor without any state in its cluster is always new.
+    max_states : int, optional
+        Most states, the failure state counted.
+    on_generation : callable, optional
+        Called as ``on_generation(generation, first_index, states, preceding)`` whenever states
+        have been added: x_2 as generation 0 with index 1, then those that each generation added,
+        shapes (k, 10) and (k,), indices ascending from `first_index`. An exception from here or
+        from `simulate` ends the growth and is passed on.
+
+    Returns
+    -------
+    Mesh
+        The same, bit for bit, whenever `simulate` gives the same answers.
+
+    Raises
+    ------
+    InputError
+        If an argument, or an answer of `simulate`, is not allowed.
+    MeshLimitError
+        If the mesh would hold more than `max_states` states.
+    """
+    slopes = check_slopes(slopes)
+    m = len(slopes)
+    first = checked_array("initial_state", initial_state, np.float64, (STATE_SIZE,))[np.newaxis]
+    _check_finite("initial_state", first)
+    threshold = _check_threshold(threshold)
+    if not (isinstance(max_states, Integral) and 2 <= max_states <= np.iinfo(np.uint32).max):
+        raise InputError("max_states", max_states, "a whole number, 2 to 4294967295")
+
+    found = StateSet(m if clustered else 1, max_states)
+    # One entry for each generation; the successors are kept for the targets, which only the
+    # final mesh decides.
+    preceding = [np.array([_slope_index(slopes, initial_slope, "initial_slope")], dtype=np.uint32)]
+    outcomes: list[np.ndarray] = []
+    successors: list[np.ndarray] = []
+    found.extend(first, np.zeros(1, np.uint32) if not clustered else preceding[0],
+                 np.ones(STATE_SIZE), threshold)  # fmt: skip
+    scales = np.full(STATE_SIZE, np.inf)
+    explored = 1
+
+    def clusters_of(slope_indices: np.ndarray) -> np.ndarray:
+        return slope_indices if clustered else np.zeros_like(slope_indices)
+
+    while explored < len(found):
+        new = found.states[explored:].copy()
+        if on_generation is not None:
+            on_generation(len(outcomes), explored, new.copy(), preceding[-1].copy())
+        tried, reached = _check_steps(simulate(new, slopes[preceding[-1]]), len(new), m)
+        explored += len(new)
+        outcomes.append(tried)
+        successors.append(reached)
+        slope_indices = _slope_indices(tried)
+        scales = _scales(found.states[1:], reached)
+        added, complete = found.extend(reached, clusters_of(slope_indices), scales, threshold)
+        if not complete:
+            raise MeshLimitError(max_states, len(outcomes), explored - 1, threshold)
+        preceding.append(slope_indices[added])
+
+    targets = np.zeros((len(found), m), dtype=np.uint32)
+    row = 1
+    for tried, reached in zip(outcomes, successors, strict=True):
+        succeeded = tried == Outcome.STEP
+        targets[row : row + len(tried)][succeeded] = found.nearest(
+            reached, clusters_of(_slope_indices(tried)), scales
+        )
+        row += len(tried)
+    return Mesh(
+        slopes=slopes,
+        states=found.states.copy(),
+        preceding=np.concatenate([np.zeros(1, np.uint32), *preceding]),
+        generation=np.repeat(
+            np.arange(len(preceding), dtype=np.uint32), [2, *map(len, preceding[1:])]
+        ),
+        targets=targets,
+        outcomes=np.concatenate([np.full((1, m), NOT_SIMULATED, np.uint8), *outcomes]),
+        scales=scales,
+        threshold=threshold,
+        clustered=clustered,
+    )
+
+
+def _slope_indices(outcomes: np.ndarray) -> np.ndarray:
+    """Index of the slope of each step that succeeded, in row-major order; uint32."""
+    columns = np.arange(outcomes.shape[1], dtype=np.uint32)
+    return np.broadcast_to(columns, outcomes.shape)[outcomes == Outcome.STEP]
