@@ -77,7 +77,7 @@ class Analysis(Node):
 
     def __init__(self) -> None:
         super().__init__("analysis")
-        self._parameters = Declared(self, AnalysisParameters)
+        self._declared = Declared(self, AnalysisParameters)
         with compiled(self.get_logger().info, "chain"):
             warm_up()
         self._estimates = CountedPublisher(self, MfptEstimate, "mfpt", RESULTS)
@@ -134,7 +134,7 @@ class Analysis(Node):
             del self._unfinished[mesh_id]
             self._due.pop(mesh_id, None)
             self._finishing.add(mesh_id)
-            self._thread.submit(self._finish, assembly, self._parameters.now)
+            self._thread.submit(self._finish, assembly, self._declared.now)
         elif assembly.status == MeshInfo.COMPLETE:
             self._due[mesh_id] = time.monotonic() + _PATIENCE
 
@@ -170,9 +170,12 @@ class Analysis(Node):
         del self._unfinished[assembly.mesh_id]
         self._due.pop(assembly.mesh_id, None)
         self._remember(assembly.mesh_id, reason)
-        log = self.get_logger()
-        ended = assembly.status in (MeshInfo.FAILED, MeshInfo.CANCELLED)
-        (log.info if ended else log.error)(f"mesh {assembly.mesh_id} cannot be used: {reason}")
+        text = f"mesh {assembly.mesh_id} cannot be used: {reason}"
+        # Two calls: rclpy wants each to keep its severity.
+        if assembly.status in (MeshInfo.FAILED, MeshInfo.CANCELLED):
+            self.get_logger().info(text)
+        else:
+            self.get_logger().error(text)
 
     def _remember(self, mesh_id: str, reason: str) -> None:
         with self._lock:

@@ -93,7 +93,7 @@ class Mesher(Node):
 
     def __init__(self) -> None:
         super().__init__("mesher")
-        self.parameters = Declared(self, MesherParameters)
+        self.declared = Declared(self, MesherParameters)
         with compiled(self.get_logger().info, "step map and mesh"):
             warm_up()
         self.info = CountedPublisher(self, MeshInfo, "mesh/info", RESULTS)
@@ -124,7 +124,7 @@ class Mesher(Node):
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _on_goal(self, goal: GrowMesh.Goal) -> GoalResponse:
-        most = self.parameters.now.max_queued
+        most = self.declared.now.max_queued
         if self._busy and len(self._waiting) >= most:
             self.get_logger().warning(f"rejected a goal: {most} are waiting already (max_queued)")
             return GoalResponse.REJECT
@@ -215,7 +215,7 @@ class _Growth:
         self._initial = settings.initial_state
         if self._initial is None:
             self._initial = find_limit_cycle(settings.controller, model=settings.model).state
-        now = node.parameters.now
+        now = node.declared.now
         self._period = now.progress_period
         self._fan_out = FanOut(
             node.simulators,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -18,8 +19,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from biped_mfpt_ros.errors import InputError
-
-_KINDS = {"bool": bool, "int": int, "float": float, "str": str, "tuple[float, ...]": tuple}
 
 
 def parameter(
@@ -42,7 +41,7 @@ def parameter(
 
 @dataclass(frozen=True)
 class NodeParameters:
-    """Base of the parameter sets. Its annotations must be of the kinds that ROS parameters have.
+    """Base of the parameter sets. Fields are bool, int, float, str or tuple[float, ...].
 
     Raises
     ------
@@ -52,9 +51,18 @@ class NodeParameters:
 
     def __post_init__(self) -> None:
         """Check type and range of every field, and turn whole numbers into floats where due."""
-        for field in dataclasses.fields(self):
-            value = _checked(field, getattr(self, field.name))
+        for field, kind in _fields(type(self)):
+            value = _checked(field, kind, getattr(self, field.name))
             object.__setattr__(self, field.name, value)
+
+
+def _fields(parameters: type[NodeParameters]) -> list[tuple[dataclasses.Field[Any], type]]:
+    """Fields with their types: bool, int, float, str or tuple."""
+    hints = typing.get_type_hints(parameters)
+    return [
+        (field, typing.get_origin(hints[field.name]) or hints[field.name])
+        for field in dataclasses.fields(parameters)
+    ]
 
 
 def _number(name: str, value: Any, kind: type, low: float, high: float, allowed: str) -> Any:
@@ -66,8 +74,7 @@ def _number(name: str, value: Any, kind: type, low: float, high: float, allowed:
     return value
 
 
-def _checked(field: dataclasses.Field[Any], value: Any) -> Any:
-    kind = _KINDS[str(field.type)]
+def _checked(field: dataclasses.Field[Any], kind: type, value: Any) -> Any:
     if kind in (bool, str):
         if not isinstance(value, kind):
             raise InputError(field.name, value, "true or false" if kind is bool else "a string")
@@ -86,11 +93,10 @@ def _checked(field: dataclasses.Field[Any], value: Any) -> Any:
     )
 
 
-def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
+def _descriptor(field: dataclasses.Field[Any], kind: type) -> ParameterDescriptor:
     # Dynamic typing, so that 1 can be given where 1.0 is meant; types are checked here instead.
     descriptor = ParameterDescriptor(description=field.metadata["description"], dynamic_typing=True)
     low, high = field.metadata["low"], field.metadata["high"]
-    kind = _KINDS[str(field.type)]
     if low is not None and high is not None and kind is int:
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     if low is not None and high is not None and kind is float:
@@ -122,16 +128,16 @@ class Declared(Generic[P]):
     """
 
     def __init__(self, node: Node, kind: type[P]) -> None:
-        fields = dataclasses.fields(kind)
+        fields = _fields(kind)
         given = {}
-        for field in fields:
+        for field, _ in fields:
             default = list(field.default) if isinstance(field.default, tuple) else field.default
             untyped = ParameterDescriptor(dynamic_typing=True)
             given[field.name] = node.declare_parameter(field.name, default, untyped).value
         self._now = kind(**given)
         # Ranges only now: a value given at the start that is out of range gets the error above.
-        for field in fields:
-            node.set_descriptor(field.name, _descriptor(field))
+        for field, type_ in fields:
+            node.set_descriptor(field.name, _descriptor(field, type_))
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._set)
 

@@ -52,7 +52,7 @@ class Simulator(Node):
 
     def __init__(self, name: str | None = None) -> None:
         super().__init__(name or default_name())
-        self._parameters = Declared(self, SimulatorParameters)
+        self._declared = Declared(self, SimulatorParameters)
         # Only then is the service there to be found: who sees a simulator can use it.
         with compiled(self.get_logger().info, "the step map"):
             warm_up()
@@ -70,7 +70,7 @@ class Simulator(Node):
                 raise InputError(
                     "step_map", request.step_map, f"{STEP_MAP}, this simulator's, or empty"
                 )
-            limits = self._parameters.now
+            limits = self._declared.now
             asked = steps_request_from(request, limits.max_states, limits.max_outcomes)
             steps = simulate_steps(
                 asked.controller, asked.states, asked.previous_slopes, asked.slopes, asked.model
