@@ -29,7 +29,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from biped_mfpt_ros.bag.definitions import message_definition
 from biped_mfpt_ros.bag.error import BagError, BagWriteError
 from biped_mfpt_ros.bag.reader import Bag
-from biped_mfpt_ros.bag.salvage import salvage
+from biped_mfpt_ros.bag.repair import salvage
 from biped_mfpt_ros.bag.sequences import SequenceCheck, leading_sequence
 from biped_mfpt_ros.bag.writer import BagWriter
 from biped_mfpt_ros.errors import InputError
@@ -351,7 +351,7 @@ def test_cut_at_any_point_gives_the_messages_before_it(tmp_path):
     write_states(tmp_path / "bag", count, every=every)
     size = (tmp_path / "bag" / "bag_0.mcap").stat().st_size
     random_ = random.Random(1)
-    points = {0, 1, 7, 8, 9, size - 1, size - 8, size - 9, *random_.sample(range(size), 50)}
+    points = {0, 1, 7, 8, 9, size - 1, size - 8, size - 9, *random_.sample(range(size), 25)}
     saved_counts = []
     for length in sorted(points):
         broken = cut(tmp_path / "bag", tmp_path / f"cut{length}", length, length % 2 == 0)
@@ -405,7 +405,7 @@ def test_damaged_bytes_never_give_an_unclear_error(tmp_path):
     shutil.copytree(tmp_path / "bag", tmp_path / "broken")
     random_ = random.Random(2)
     refusals = []
-    for i in range(150):
+    for i in range(100):
         data = bytearray(whole)
         # From single bits to whole stretches of noise.
         start = random_.randrange(len(data))
@@ -421,7 +421,7 @@ def test_damaged_bytes_never_give_an_unclear_error(tmp_path):
             refusals.append(str(error))
         # Checksums: what is read is what was written.
         assert [serialised(m) for m in read] == good[: len(read)]
-    assert len(refusals) > 75
+    assert len(refusals) > 50
     assert all("/broken" in refusal for refusal in refusals)
 
 

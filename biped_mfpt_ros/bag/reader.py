@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import zstandard
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
 from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -141,7 +141,7 @@ class Bag:
         for raw in self.raw_messages():
             if types is None or raw.type_name in types:
                 yield BagMessage(
-                    raw.topic, raw.type_name, self._decode(raw), raw.log_time, raw.publish_time
+                    raw.topic, raw.type_name, self.decode(raw), raw.log_time, raw.publish_time
                 )
 
     def raw_messages(self, on_error: Callable[[str], object] | None = None) -> Iterator[RawMessage]:
@@ -166,7 +166,7 @@ class Bag:
         def fail(error: BagError) -> None:
             if on_error is None:
                 raise error
-            on_error(error.problem)
+            on_error(f"{Path(error.value).name} {error.problem}")
 
         self.topics.clear()
         for file in self.files:
@@ -178,14 +178,12 @@ class Bag:
             read = self.topics[topic.name].count if topic.name in self.topics else 0
             if read != topic.count:
                 fail(
-                    self._error(
+                    BagError(
+                        self.path,
                         f"holds {read} messages on {topic.name}, of {topic.count} that "
-                        f"{FILE_NAME} names"
+                        f"{FILE_NAME} names",
                     )
                 )
-
-    def _error(self, problem: str) -> BagError:
-        return BagError(self.path, problem)
 
     def _find_files(self) -> list[Path]:
         if not os.path.exists(self.path):
@@ -275,7 +273,8 @@ class Bag:
                 parse_qos(channel.metadata.get("offered_qos_profiles")),
             )
 
-    def _decode(self, raw: RawMessage) -> Any:
+    def decode(self, raw: RawMessage) -> Any:
+        """Decode a message; raises BagError if it does not fit its definition."""
         if raw.schema is None:
             raise BagError(self.path, f"has no definition of the messages on {raw.topic}")
         self._learn(raw.schema, raw.channel)
@@ -378,6 +377,8 @@ def _damage(error: Exception, stream: _Bounded) -> str:
     if stream.whole == stream.size:
         return "has no end: what came after its last flush is lost"
     where = f"at byte {stream.whole} of {stream.size}"
-    if isinstance(error, (EndOfFile, struct.error)) or stream.position == stream.size:
+    # The limit is the size of the file.
+    short = (EndOfFile, RecordLengthLimitExceeded, struct.error)
+    if isinstance(error, short) or stream.position == stream.size:
         return f"is cut off {where}"
     return f"is damaged {where}: {error or type(error).__name__}"

@@ -63,7 +63,7 @@ def salvage(bag: str | os.PathLike[str], new_bag: str | os.PathLike[str]) -> Sal
     first = next(messages, None)
     if first is None:
         raise BagError(
-            source.path, "; ".join(["no message in it can be read", source.fault, *missing])
+            source.path, "; ".join(["no message in it can be read", *(missing or [source.fault])])
         )
     with BagWriter(new_bag) as writer:
         for message in chain([first], messages):
