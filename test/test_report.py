@@ -234,8 +234,8 @@ class TestPictures:
         steps = np.diff(walk.feet, axis=0)
         # The state returns to itself up to the tolerance of the integrator.
         np.testing.assert_allclose(steps, [[cycle.step_length, 0.0]] * 3, atol=1e-6)
-        # Figures at regular times, the time carried over from step to step.
-        expected = math.ceil(3 * cycle.period / 0.085)
+        # Figures at regular times, the time carried over from step to step, and one at the end.
+        expected = math.ceil(3 * cycle.period / 0.085) + 1
         assert len(walk.points) == expected
         # Nobody is below the ground by more than the rounding of Table 1.
         assert walk.points[:, :, 1].min() > -1e-4
@@ -244,6 +244,13 @@ class TestPictures:
         walk = pictures.walk(cycle.controller, cycle.state, [0.0, SLOPE_LIMIT, 0.0], WalkerModel())
         assert walk.outcome is not Outcome.STEP
         assert walk.steps[-1] == 1
+
+    def test_walk_that_falls_at_once(self, cycle):
+        state = cycle.state.copy()
+        state[0] = 0.0  # the stance leg points up
+        walk = pictures.walk(cycle.controller, state, [0.0, 0.0], WalkerModel())
+        assert walk.outcome is not Outcome.STEP
+        assert len(walk.points) >= 1
 
     def test_example_is_always_the_same(self, cycle):
         first, second = (

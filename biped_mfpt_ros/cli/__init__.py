@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -37,14 +38,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args = make_parser().parse_args(arguments)
     except SystemExit as end:  # --help, --version, or bad input that has been reported
         return int(end.code or 0)
+    stopped = False
+
+    def stop(number: int, frame: object) -> None:
+        nonlocal stopped
+        stopped = True
+        raise KeyboardInterrupt
+
+    # A stop by SIGTERM is to be as orderly as one by Ctrl-C.
+    handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         return _run(args)
+    except KeyboardInterrupt:
+        return EXIT_STOPPED
     except BrokenPipeError:
         # The reader of stdout is gone, as with `| head`. Python would notice it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED
-    except KeyboardInterrupt:
-        return EXIT_STOPPED
+    except Exception:
+        # A callback from C code swallows KeyboardInterrupt; what it came from then fails.
+        if stopped:
+            return EXIT_STOPPED
+        raise
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def _run(args: argparse.Namespace) -> int:

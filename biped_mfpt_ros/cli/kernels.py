@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -14,9 +15,18 @@ from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.gait.step import simulate_steps
 from biped_mfpt_ros.gait.trace import trace_swing
-from biped_mfpt_ros.nodes.warm_up import compiled
+from biped_mfpt_ros.nodes.warm_up import announced, compiled
 from biped_mfpt_ros.report.progress import Progress, duration_text
 from biped_mfpt_ros.walker.robot import rabbit
+
+_WHAT = "the numeric kernels"
+
+
+@contextmanager
+def work(quiet: bool) -> Iterator[Progress]:
+    """A progress line for something that may have to compile kernels first, and says so then."""
+    with Progress(quiet=quiet) as progress, announced(progress.say, _WHAT):
+        yield progress
 
 
 def compile_kernels(args: argparse.Namespace) -> None:
@@ -35,7 +45,7 @@ def compile_all(say: Callable[[str], object]) -> None:
     """Run every kernel on something small; ``say`` is told when one has to be compiled."""
     walking, slopes = controller("hzd/base"), np.radians([-1.0, 0.0, 1.0])
     state = walking.reference_state(1.7, rabbit())
-    with compiled(say, "the numeric kernels"):
+    with compiled(say, _WHAT):
         monte_carlo(walking, 0.1, 1, 0, state=state, threads=1)
         trace_swing(walking, state, 0.0, 0.0)
         grow_mesh(

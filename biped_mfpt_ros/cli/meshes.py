@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from biped_mfpt_ros.chain.markov import metastability
 from biped_mfpt_ros.chain.mesh import Mesh, grow_mesh
 from biped_mfpt_ros.cli import options
 from biped_mfpt_ros.cli.growth import Growth
+from biped_mfpt_ros.cli.kernels import work
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.results import estimate_row, mfpt_table
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
-from biped_mfpt_ros.report.progress import Progress, duration_text
+from biped_mfpt_ros.report.progress import duration_text
 
 _MESH_ARRAYS = (
     "slopes", "states", "preceding", "generation", "targets", "outcomes", "scales",
@@ -49,6 +49,8 @@ def mesh(args: argparse.Namespace) -> None:
 
 def mfpt(args: argparse.Namespace) -> None:
     """Mesh a controller and compute its MFPT."""
+    from biped_mfpt_ros.chain.markov import metastability
+
     mean = options.slope("--mean", args.mean)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
     grown, result = _grow(args)
@@ -77,7 +79,7 @@ def _grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:
     controller, model = options.controller_of(args), options.model_of(args)
     slopes = options.slopes_of(args)
     settings = options.mesh_settings(args)
-    with Progress(quiet=args.quiet) as progress, Growth(controller, slopes, model, progress) as by:
+    with work(args.quiet) as progress, Growth(controller, slopes, model, progress) as by:
         initial = find_limit_cycle(controller, 0.0, model).state
         start = time.perf_counter()
         grown = grow_mesh(

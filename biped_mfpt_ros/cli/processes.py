@@ -60,10 +60,10 @@ class Processes:
     """Child processes of this one, all stopped at the end of the ``with`` block.
 
     Inside the block SIGINT, SIGTERM and SIGHUP raise `Stopped` in the main thread, where the block
-    must be. Each child has a session of its own, so that Ctrl-C on the terminal reaches this
-    process alone and children are stopped in order: SIGTERM to all but the last ones, SIGKILL to
-    those that are left after 2 s, then the same for the last ones. A second signal meanwhile kills
-    what is left at once.
+    must be; once one came, the block ends with `Stopped` and nothing else. Each child has a session
+    of its own, so that Ctrl-C on the terminal reaches this process alone and children are stopped
+    in order: SIGTERM to all but the last ones, SIGKILL to those that are left after 2 s, then the
+    same for the last ones. A second signal meanwhile kills what is left at once.
 
     Parameters
     ----------
@@ -145,7 +145,9 @@ class Processes:
                 self._handlers[number] = signal.signal(number, self._on_signal)
         return self
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
+    ) -> None:
         """Stop all children and give the signals back."""
         # From here on a signal is only counted.
         self._holding = True
@@ -154,6 +156,10 @@ class Processes:
         finally:
             for number, handler in self._handlers.items():
                 signal.signal(number, handler)
+        # A callback from C code swallows what is raised in it, and the code that called it may go
+        # on or fail for that reason.
+        if self._signals and not isinstance(error, KeyboardInterrupt):
+            raise Stopped from error
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._signals += 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from biped_mfpt_ros.gait.monte_carlo import MonteCarlo
@@ -25,13 +25,13 @@ def monte_carlo_result(result: MonteCarlo) -> dict[str, Any]:
     }
 
 
-def shares(values: dict[Outcome, float]) -> dict[str, float]:
-    """Failure shares by the outcome's name, for JSON, the largest first."""
+def shares(values: Mapping[int, float]) -> dict[str, float]:
+    """Failure shares (by outcome code) by the outcome's name, for JSON, the largest first."""
     ordered = sorted(values.items(), key=lambda item: -item[1])
-    return {outcome.name.lower(): share for outcome, share in ordered if share > 0.0}
+    return {Outcome(code).name.lower(): share for code, share in ordered if share > 0.0}
 
 
-def shares_table(values: dict[Outcome, float]) -> str:
+def shares_table(values: Mapping[int, float]) -> str:
     """Failure shares for readers."""
     rows = [
         (name.replace("_", " "), f"{100.0 * share:.1f} %") for name, share in shares(values).items()
@@ -40,7 +40,7 @@ def shares_table(values: dict[Outcome, float]) -> str:
 
 
 def estimate_row(
-    controller: str, mean_deg: float, sigma_deg: float, found: Any, falls: dict[Outcome, float]
+    controller: str, mean_deg: float, sigma_deg: float, found: Any, falls: Mapping[int, float]
 ) -> dict[str, Any]:
     """An estimate of the MFPT, for JSON; ``found`` has mfpt, failure_probability, lambda_2."""
     return {

@@ -7,6 +7,7 @@ import argparse
 import numpy as np
 
 from biped_mfpt_ros.cli import options
+from biped_mfpt_ros.cli.kernels import work
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.results import monte_carlo_result, shares_table
 from biped_mfpt_ros.control.controller import catalogue
@@ -14,7 +15,6 @@ from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo as walk
 from biped_mfpt_ros.gait.step import check_states, simulate_steps
 from biped_mfpt_ros.report import paper
-from biped_mfpt_ros.report.progress import Progress
 from biped_mfpt_ros.report.tables import number, table
 from biped_mfpt_ros.walker.outcome import Outcome
 
@@ -25,7 +25,8 @@ def step(args: argparse.Namespace) -> None:
     previous = options.slope("--previous-slope", args.previous_slope)
     slope = options.slope("--slope", args.slope)
     states = check_states([args.state])
-    steps = simulate_steps(controller, states, [previous], [slope], model)
+    with work(args.quiet):
+        steps = simulate_steps(controller, states, [previous], [slope], model)
     outcome = Outcome(int(steps.outcomes[0, 0]))
     result = options.described(controller, model) | {
         "state": states[0],
@@ -53,7 +54,8 @@ def cycle(args: argparse.Namespace) -> None:
     """Find a limit cycle."""
     controller, model = options.controller_of(args), options.model_of(args)
     slope = options.slope("--slope", args.slope)
-    found = find_limit_cycle(controller, slope, model)
+    with work(args.quiet):
+        found = find_limit_cycle(controller, slope, model)
     magnitudes = np.abs(found.eigenvalues)
     if args.json:
         result = options.described(controller, model) | {
@@ -90,7 +92,7 @@ def monte_carlo(args: argparse.Namespace) -> None:
     """Walk on random slopes until the fall."""
     controller, model = options.controller_of(args), options.model_of(args)
     mean, sigma = options.slope("--mean", args.mean), options.spread("--sigma", args.sigma)
-    with Progress(quiet=args.quiet) as progress:
+    with work(args.quiet) as progress:
         result = walk(
             controller,
             sigma,

@@ -105,22 +105,24 @@ def walk(
     for number, slope in enumerate(slopes):
         swing = trace_swing(controller, state, previous, slope, model)
         passed.append(slope)
-        end = swing.times[-1] if swing.times.size else 0.0
+        # A fall at the very start leaves no samples.
+        at = swing.times if swing.times.size else np.zeros(1)
+        states = swing.states if swing.times.size else np.asarray(state)[None]
+        end = at[-1]
         times = np.arange(late, end, interval)
         if times.size:
-            sampled = np.stack(
-                [np.interp(times, swing.times, column) for column in swing.states.T], axis=1
-            )
+            sampled = np.stack([np.interp(times, at, column) for column in states.T], axis=1)
             points.append(link_points(sampled, model.robot) + foot)
             steps.append(np.full(times.size, number))
             late = times[-1] + interval - end
         else:
             late -= end
         outcome = swing.outcome
-        last = link_points(swing.states[-1:], model.robot)[0] + foot
-        if swing.next_state is None:
+        last = link_points(states[-1:], model.robot)[0] + foot
+        if swing.next_state is None or number == len(slopes) - 1:
             points.append(last[None])
             steps.append(np.full(1, number))
+        if swing.next_state is None:
             feet.append(foot + math.cos(slope) * np.array([0.45, 0.45 * math.tan(slope)]))
             break
         foot, state, previous = last[5], swing.next_state, slope
