@@ -6,7 +6,7 @@ ARGS ?=
 # An ordinary ROS 2 that is active in this shell must not leak into .venv, which has its own.
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH
 
-.PHONY: help setup run test lint bench clean
+.PHONY: help setup run test lint clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
