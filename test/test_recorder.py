@@ -1,0 +1,283 @@
+"""The recorder as a process of its own: what it hears is in the bag, however it ends."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import signal
+import time
+from collections import Counter
+from itertools import count
+from pathlib import Path
+
+import pytest
+from biped_mfpt_msgs import msg as messages
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from ros_graph import ros_graph, wait_for
+from rosbags.highlevel import AnyReader
+
+from biped_mfpt_ros.bag import Bag, BagError, salvage
+from biped_mfpt_ros.nodes.publishers import CountedPublisher
+from biped_mfpt_ros.nodes.qos import PROGRESS, RESULTS
+
+RESULT_TOPICS = {
+    "mesh/info": messages.MeshInfo,
+    "mesh/states": messages.MeshStates,
+    "mesh/transitions": messages.MeshTransitions,
+    "mfpt": messages.MfptEstimate,
+    "optimisation/trials": messages.OptimisationTrial,
+}
+
+
+class Publisher(Node):
+    """Publishes on topics of the pipeline, and remembers what."""
+
+    def __init__(self):
+        super().__init__("pipeline", namespace="/run")
+        self.sent: dict[str, list[object]] = {}
+        self._publishers_by_topic: dict[str, CountedPublisher] = {}
+
+    def send(self, topic, message, qos=RESULTS):
+        if topic not in self._publishers_by_topic:
+            self._publishers_by_topic[topic] = CountedPublisher(self, type(message), topic, qos)
+        self._publishers_by_topic[topic].publish(message)
+        self.sent.setdefault(f"/run/{topic}", []).append(message)
+
+    def skip(self, topic, number):
+        """Count messages as sent that are not."""
+        self._publishers_by_topic[topic]._sequence += number
+
+    def is_recorded(self, topic):
+        return any(
+            info.node_name == "recorder"
+            for info in self.get_subscriptions_info_by_topic(f"/run/{topic}")
+        )
+
+    def wait_until_received(self, topic):
+        """Wait until the recorder has acknowledged all messages."""
+        publisher = self._publishers_by_topic[topic]._publisher
+        wait_for(publisher.get_subscription_count, "the recorder")
+        assert publisher.wait_for_all_acked(Duration(seconds=20))
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        yield graph
+
+
+def record(graph, bag, *arguments):
+    process = graph.launch(
+        "recorder", "--ros-args", "-r", "__ns:=/run", "-p", f"bag:={bag}", *arguments
+    )
+    return process
+
+
+def stop(process, how=signal.SIGTERM):
+    """Exit code and log of a recorder."""
+    process.send_signal(how)
+    _, log = process.communicate(timeout=20.0)
+    return process.returncode, log
+
+
+def noise(seed, size=300):
+    random_ = random.Random(seed)
+    return [random_.random() for _ in range(size)]
+
+
+def flushed(bag: Path) -> Counter[str]:
+    """Messages by topic in a bag that is being recorded."""
+    unfinished = Bag(bag, unfinished=True)
+    return Counter(raw.topic for raw in unfinished.raw_messages(on_error=lambda problem: None))
+
+
+def recorded_states(bag: Path) -> list[messages.MeshStates]:
+    return [
+        deserialize_message(raw.data, messages.MeshStates)
+        for raw in Bag(bag).raw_messages()
+        if raw.topic == "/run/mesh/states"
+    ]
+
+
+def flushed_size(bag: Path) -> int:
+    return (bag / f"{bag.name}_0.mcap").stat().st_size
+
+
+def test_everything_published_is_in_the_bag(graph, tmp_path):
+    bag = tmp_path / "new" / "bag"
+    publisher = graph.start(Publisher)
+    # Before there is a recorder: latched topics are kept for it.
+    for i in range(30):
+        for topic, kind in RESULT_TOPICS.items():
+            publisher.send(topic, kind(message="x" * i) if kind is messages.MeshInfo else kind())
+    process = record(graph, bag)
+    publisher.send("mesh/progress", messages.MeshProgress(), PROGRESS)
+    for topic in (*RESULT_TOPICS, "mesh/progress"):
+        wait_for(lambda topic=topic: publisher.is_recorded(topic), topic)
+    for i in range(30):
+        publisher.send("mesh/states", messages.MeshStates(mesh_id="mesh", states=noise(i)))
+    publisher.send("mesh/progress", messages.MeshProgress(mesh_id="mesh"), PROGRESS)
+    publisher.get_logger().info("a line of the log")
+    publisher.send("mfpt", messages.MfptEstimate(mesh_id="last"))
+    sent = {topic: len(all_sent) for topic, all_sent in publisher.sent.items()}
+    del sent["/run/mesh/progress"]  # not latched: there may be fewer
+    wait_for(lambda: sent.items() <= flushed(bag).items(), "all to be flushed")
+    with pytest.raises(BagError, match="still being recorded"):
+        Bag(bag)
+    saved = salvage(bag, tmp_path / "saved").counts
+    code, log = stop(process)
+    assert code == 0, log
+
+    hashes = {
+        f"/run/{topic}": str(
+            publisher.get_publishers_info_by_topic(f"/run/{topic}")[0].topic_type_hash
+        )
+        for topic in publisher._publishers_by_topic
+    }
+    with AnyReader([bag]) as reader:
+        recorded: dict[str, list[bytes]] = {}
+        for connection, _, data in reader.messages():
+            recorded.setdefault(connection.topic, []).append(data)
+        connections = {c.topic: c for c in reader.connections}
+        for line in recorded.pop("/rosout"):
+            text = reader.deserialize(line, "rcl_interfaces/msg/Log").msg
+            if text == "a line of the log":
+                break
+        else:
+            pytest.fail("the log is not in the bag")
+    assert connections.pop("/rosout")
+    kinds = {f"/run/{topic}": kind for topic, kind in RESULT_TOPICS.items()}
+    progress = recorded.pop("/run/mesh/progress")
+    last = publisher.sent.pop("/run/mesh/progress")[-1]
+    assert deserialize_message(progress[-1], messages.MeshProgress) == last
+    assert publisher.sent == {
+        topic: [deserialize_message(data, kinds[topic]) for data in all_data]
+        for topic, all_data in recorded.items()
+    }
+    assert {topic: c.digest for topic, c in connections.items()} == hashes
+    for topic, connection in connections.items():
+        (qos,) = connection.ext.offered_qos_profiles
+        latched = topic != "/run/mesh/progress"
+        assert qos.durability.name == ("TRANSIENT_LOCAL" if latched else "VOLATILE")
+        assert qos.reliability.name == "RELIABLE"
+    for message in Bag(bag).messages():
+        assert 0 <= message.log_time - message.publish_time < 60e9
+        assert abs(message.log_time - time.time_ns()) < 60e9
+    for topic, sent in publisher.sent.items():
+        assert f"{topic}: received {len(sent)} messages of {len(sent)} published" in log
+        assert saved[topic] == len(sent)  # while it was being recorded
+
+
+def test_lost_messages_are_errors_in_the_log(graph, tmp_path):
+    publisher = graph.start(Publisher)
+    publisher.send("mesh/info", messages.MeshInfo())
+    publisher.skip("mesh/info", 3)
+    publisher.send("mesh/info", messages.MeshInfo())
+    process = record(graph, tmp_path / "bag")
+    wait_for(lambda: publisher.is_recorded("mesh/info"), "mesh/info")
+    publisher.skip("mesh/info", 1)
+    publisher.send("mesh/info", messages.MeshInfo())
+    wait_for(lambda: flushed(tmp_path / "bag")["/run/mesh/info"] == 3, "all to be flushed")
+    code, log = stop(process, signal.SIGINT)
+    assert code == 0
+    assert "[ERROR]" in log
+    assert "/run/mesh/info: messages 1 to 3 are missing" in log
+    assert "/run/mesh/info: message 5 is missing" in log
+    assert "received 3 messages of 7 published: 4 missing, 0 repeated" in log
+    assert Bag(tmp_path / "bag").metadata.count >= 3
+
+
+def test_killed_recorder_loses_at_most_a_second(graph, tmp_path):
+    bag = tmp_path / "bag"
+    publisher = graph.start(Publisher)
+    publisher.send("mesh/states", messages.MeshStates(states=noise(0)))
+    process = record(graph, bag)
+    wait_for(lambda: publisher.is_recorded("mesh/states"), "mesh/states")
+    times = []
+    end = time.monotonic() + 2.0
+    for i in count(1):
+        if time.monotonic() > end:
+            break
+        times.append(time.monotonic())
+        publisher.send("mesh/states", messages.MeshStates(states=noise(i)))
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    killed = time.monotonic()
+    process.wait()
+    # Half a second until it is flushed, and half for the way there on a busy machine.
+    due = 1 + sum(killed - sent > 1.0 for sent in times)
+    assert due > 50
+    assert [path.name for path in bag.iterdir()] == ["bag_0.mcap"]
+    with pytest.raises(BagError, match="has no end"):
+        Bag(bag)
+    saved = salvage(bag, tmp_path / "saved")
+    assert saved.counts["/run/mesh/states"] >= due
+    assert any("has no end" in text for text in saved.missing)
+    read = recorded_states(tmp_path / "saved")
+    assert read == publisher.sent["/run/mesh/states"][: len(read)]
+
+
+def test_stopped_in_full_swing_the_bag_is_whole(graph, tmp_path):
+    bag = tmp_path / "bag"
+    publisher = graph.start(Publisher)
+    publisher.send("mesh/states", messages.MeshStates())
+    process = record(graph, bag, "-p", "flush_period:=0.01")
+    publisher.wait_until_received("mesh/states")
+    for i in range(300):
+        publisher.send("mesh/states", messages.MeshStates(states=noise(i, 20)))
+    publisher.wait_until_received("mesh/states")
+    for i in range(100):
+        publisher.send("mesh/states", messages.MeshStates(states=noise(i, 20)))
+        if i == 50:
+            process.send_signal(signal.SIGINT)
+    code, log = stop(process, signal.SIGTERM)  # a second signal changes nothing
+    assert code == 0, log
+    read = recorded_states(bag)
+    # All that had arrived, whether the node had taken it or not.
+    assert len(read) >= 301
+    assert read == publisher.sent["/run/mesh/states"][: len(read)]
+
+
+def test_full_disk_ends_the_recorder_with_a_clear_error(graph, tmp_path):
+    bag = tmp_path / "bag"
+    publisher = graph.start(Publisher)
+    publisher.send("mesh/states", messages.MeshStates())
+    process = record(graph, bag, "-p", "flush_period:=0.05")
+    wait_for(lambda: publisher.is_recorded("mesh/states"), "mesh/states")
+    # A limit on the size of its files fails a write in the same way as a full disk does.
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
+    for i in range(60):
+        publisher.send("mesh/states", messages.MeshStates(states=noise(i)))
+        time.sleep(0.005)
+    _, log = process.communicate(timeout=20.0)
+    assert process.returncode == 1
+    assert "[FATAL]" in log
+    assert f"cannot be written: {os.strerror(27)}; it is not whole" in log
+    assert str(bag) in log
+    assert flushed_size(bag) <= 100_000
+    with pytest.raises(BagError, match="has no end"):
+        Bag(bag)
+    assert salvage(bag, tmp_path / "saved").counts["/run/mesh/states"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((), "exists already"),
+        (("-p", "bag:=/proc/bag"), "cannot be made"),
+        (("-p", "flush_period:=2.0"), "flush_period: 2.0 is not allowed; allowed: a number from"),
+        (("-p", "further_topics:=a//b"), "further_topics: 'a//b' is not allowed"),
+    ],
+)
+def test_bad_parameter_is_a_clear_error(graph, tmp_path, arguments, text):
+    (tmp_path / "bag").mkdir()
+    bag = tmp_path / ("bag" if not arguments else "new")
+    process = record(graph, bag, *arguments)
+    _, log = process.communicate(timeout=20.0)
+    assert process.returncode == 2
+    assert text in log
+    assert "Traceback" not in log
+    assert not list(tmp_path.glob("*/*"))
