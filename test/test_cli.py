@@ -129,7 +129,7 @@ class TestInProcess:
         result = run_json(capsys, *arguments, "--seed", "1")
         assert result["walks"] == 300
         assert result["seed"] == 1
-        assert result["sigma"] == pytest.approx(math.radians(2.0), rel=1e-15)
+        assert result["sigma_s"] == pytest.approx(math.radians(2.0), rel=1e-15)
         assert result["paper"] == 2.2487
         low, high = result["confidence_interval"]
         assert low < result["mean_steps"] < high
@@ -170,6 +170,24 @@ class TestBadInput:
             (["monte-carlo", "--sigma", "2", "--seed", "-1"], "--seed", "-1"),
             (["monte-carlo", "--sigma", "2", "--mean", "-90"], "--mean", "-90"),
             (["monte-carlo", "--sigma", "2", "--max-steps", "0"], "--max-steps", "0"),
+            (["mesh", "--threshold", "-0.1"], "--threshold", "-0.1"),
+            (["mesh", "--slope-step", "0.3"], "--slope-step", "0.3"),
+            (["mesh", "--slope-limit", "-20"], "--slope-limit", "-20"),
+            (["mesh", "--max-states", "1"], "--max-states", "1"),
+            (["mfpt"], "--sigma", None),
+            (["mfpt", "--sigma"], "--sigma", None),
+            (["mfpt", "--sigma", "1", "0"], "--sigma", "0.0"),
+            (["mfpt", "--sigma", "1", "--mean", "nan"], "--mean", "nan"),
+            (["run", "--workers", "0"], "--workers", "0"),
+            (["run", "--walks", "-1"], "--walks", "-1"),
+            (["run", "--seed", "-1"], "--seed", "-1"),
+            (["run", "--threshold", "0"], "--threshold", "0.0"),
+            (["run", "--sigma", "1", "100"], "--sigma", "100"),
+            (["run", "--mean", "50"], "--mean", "50"),
+            (["run", "--namespace", "1st"], "--namespace", "1st"),
+            (["run", "--output", "."], "--output", "."),
+            (["inspect", "no/such/bag"], "BAG", "no/such/bag"),
+            (["inspect", "bag", "--sigma", "-1"], "--sigma", "-1"),
             (["node", "nothing"], "NAME", "nothing"),
             (["dance"], "COMMAND", "dance"),
             ([], "COMMAND", None),
@@ -227,7 +245,16 @@ class TestHelp:
         ).stdout
         assert out.splitlines()[-1] == "[]"
 
-    @pytest.mark.parametrize("name", ["run", "mfpt", "mesh", "monte-carlo", "cycle", "step"])
+    def test_state_limit_in_the_text_is_that_of_the_core(self):
+        from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES
+
+        parser = make_parser().parse_args(["mesh"]).parser
+        (text,) = (a.help for a in parser._actions if a.dest == "max_states")
+        assert f"(default: {DEFAULT_MAX_STATES})" in text
+
+    @pytest.mark.parametrize(
+        "name", ["run", "mfpt", "mesh", "monte-carlo", "cycle", "step", "inspect"]
+    )
     def test_every_example_is_accepted(self, name):
         parser = make_parser()
         epilog = parser.parse_args([name, *_required(name)]).parser.epilog
@@ -244,7 +271,65 @@ def _required(name):
         "mfpt": ["--sigma", "1"],
         "monte-carlo": ["--sigma", "1"],
         "step": ["--state", STATE],
+        "inspect": ["bag"],
     }.get(name, [])
+
+
+class TestMesh:
+    ARGUMENTS = ("--controller", "hzd/cot", "--slope-step", "0.5", "--threshold", "0.3")
+
+    def test_mfpt(self, capsys):
+        result = run_json(capsys, "mfpt", *self.ARGUMENTS, "--sigma", "1", "2")
+        assert [row["sigma_s_deg"] for row in result["estimates"]] == [1.0, 2.0]
+        one, two = result["estimates"]
+        assert one["mfpt"] > two["mfpt"] > 1.0
+        for row in (one, two):
+            assert row["sigma_s"] == pytest.approx(math.radians(row["sigma_s_deg"]), rel=1e-15)
+            assert row["mfpt"] == pytest.approx(1.0 / row["failure_probability"], rel=1e-15)
+            assert sum(row["failure_shares"].values()) == pytest.approx(1.0, abs=1e-12)
+        assert (one["paper"], two["paper"]) == (7.3, 2.2049)
+        assert result["swings"] == result["states"] - 1  # none from the failure state
+        assert result["slopes"] == 81
+
+    def test_equals_the_core(self, capsys):
+        from biped_mfpt_ros.chain.markov import metastability
+        from biped_mfpt_ros.chain.mesh import grow_mesh
+        from biped_mfpt_ros.control.controller import controller
+        from biped_mfpt_ros.gait.cycle import find_limit_cycle
+        from biped_mfpt_ros.gait.step import simulate_steps
+        from biped_mfpt_ros.walker.terrain import slope_set
+
+        result = run_json(
+            capsys, "mfpt", *self.ARGUMENTS, "--sigma", "1.5", "--mean", "-0.5",
+            "--unclustered", "--friction", "0.7",
+        )  # fmt: skip
+        walking, slopes, model = controller("hzd/cot"), slope_set(0.5), WalkerModel(friction=0.7)
+        mesh = grow_mesh(
+            lambda states, previous: simulate_steps(walking, states, previous, slopes, model),
+            find_limit_cycle(walking, model=model).state,
+            slopes,
+            0.3,
+            clustered=False,
+        )
+        expected = metastability(mesh, math.radians(-0.5), math.radians(1.5))
+        assert result["states"] == len(mesh.states)
+        assert result["estimates"][0]["mfpt"] == expected.mfpt
+
+    def test_mesh_in_a_file(self, capsys, tmp_path):
+        path = tmp_path / "mesh.of.cot"
+        result = run_json(capsys, "mesh", *self.ARGUMENTS, "--output", str(path))
+        with np.load(path) as arrays:
+            assert arrays["states"].shape == (result["states"], 10)
+            assert arrays["targets"].shape == (result["states"], 81)
+            assert float(arrays["threshold"]) == 0.3
+        line = run_bad(capsys, "mesh", *self.ARGUMENTS, "--output", str(path))
+        assert "--output" in line
+        assert str(path) in line
+
+    def test_limit_on_states(self, capsys):
+        assert main(["mesh", *self.ARGUMENTS, "--max-states", "5", "--quiet"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "max_states = 5" in line
 
 
 def test_json_text():
@@ -396,3 +481,148 @@ class TestProcesses:
 
         with pytest.raises(SystemExit):
             end_with(os.getppid() + 1)
+
+
+class Run:
+    """`biped-mfpt run` as a process, in a directory of its own."""
+
+    def __init__(self, directory, *arguments):
+        self.directory = directory
+        self.process = subprocess.Popen(
+            [*COMMAND, "run", "--controller", "hzd/cot", *arguments],
+            cwd=directory,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # The package is imported from where the tests import it.
+            env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+        )
+
+    def nodes(self):
+        """Process ids of the nodes that are running, by what they are."""
+        found = {}
+        for path in Path("/proc").glob("[0-9]*/cmdline"):
+            try:
+                words = path.read_bytes().decode().split("\0")
+            except OSError:
+                continue
+            if "--end-with" in words and str(self.process.pid) in words:
+                name = words[words.index(str(self.process.pid)) + 1]
+                found.setdefault(name, []).append(int(path.parent.name))
+        return found
+
+    def wait_for_nodes(self):
+        wait_until(lambda: sum(map(len, self.nodes().values())) == 5, self, "five nodes")
+
+    def wait_for_mesh(self):
+        """Wait until a mesh is being recorded."""
+        bag = self.directory / "run" / "bag"
+        wait_until(
+            lambda: any(path.stat().st_size > 10_000 for path in bag.glob("*.mcap")), self, "a bag"
+        )
+
+    def end(self, timeout=60.0):
+        try:
+            out, err = self.process.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            pytest.fail(f"still running after {timeout} s: {self.process.communicate()}")
+        return self.process.returncode, out, err
+
+
+def wait_until(condition, run, what, timeout=60.0):
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if run.process.poll() is not None:
+            pytest.fail(f"ended while waiting for {what}: {run.process.communicate()}")
+        if time.monotonic() > deadline:
+            run.process.kill()
+            pytest.fail(f"waited {timeout} s for {what}: {run.process.communicate()}")
+        time.sleep(0.05)
+
+
+# A mesh that takes long enough to be interrupted.
+LONG = ("--slope-step", "0.25", "--threshold", "1e-6", "--max-states", "1000000", "--output", "run")
+
+
+class TestRun:
+    def test_result_is_that_of_one_process_although_a_simulator_dies(self, tmp_path, capsys):
+        arguments = ("--threshold", "0.3", "--sigma", "1", "2")
+        more = ("--workers", "2", "--walks", "50", "--json", "--output", "run")
+        run = Run(tmp_path, *arguments, *more)
+        run.wait_for_nodes()
+        os.kill(run.nodes()["simulator"][0], signal.SIGKILL)
+        code, out, err = run.end()
+        assert code == 0, err
+        assert "was killed by SIGKILL" in err
+        assert "going on with 1 simulator" in err
+        assert run.nodes() == {}
+        result = json.loads(out)
+        alone = run_json(capsys, "mfpt", "--controller", "hzd/cot", *arguments)
+        assert result["states"] == alone["states"]
+        assert result["estimates"] == alone["estimates"]
+        assert [point["sigma_s"] for point in result["curve"]] == sorted(
+            point["sigma_s"] for point in result["curve"]
+        )
+        assert {row["walks"] for row in result["monte_carlo"]} == {50}
+        assert json.loads((tmp_path / "run" / "result.json").read_text()) == result
+        assert (tmp_path / "run" / "mfpt.png").read_bytes().startswith(b"\x89PNG")
+        inspected = run_json(capsys, "inspect", str(tmp_path / "run" / "bag"))
+        assert inspected["problems"] == []
+        (mesh,) = inspected["meshes"]
+        assert [row["mfpt"] for row in mesh["estimates"]] == [
+            row["mfpt"] for row in alone["estimates"]
+        ]
+        assert main(["inspect", str(tmp_path / "run" / "bag")]) == 0
+        assert repr(mesh["estimates"][0]["mfpt"]) in capsys.readouterr().out
+
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+    def test_signal_stops_everything_and_closes_the_bag(self, tmp_path, number):
+        run = Run(tmp_path, *LONG)
+        run.wait_for_mesh()
+        start = time.monotonic()
+        run.process.send_signal(number)
+        code, _, err = run.end()
+        assert code == 130, err
+        assert time.monotonic() - start < 5.0
+        assert run.nodes() == {}
+        assert (tmp_path / "run" / "bag" / "metadata.yaml").exists()
+
+    def test_nodes_end_with_a_killed_parent(self, tmp_path):
+        run = Run(tmp_path, *LONG)
+        run.wait_for_mesh()
+        run.process.kill()
+        start = time.monotonic()
+        while run.nodes():
+            assert time.monotonic() - start < 5.0, run.nodes()
+            time.sleep(0.05)
+        run.end()
+        assert (tmp_path / "run" / "bag" / "metadata.yaml").exists()
+
+    def test_a_node_that_dies_ends_the_run_with_its_log(self, tmp_path):
+        run = Run(tmp_path, *LONG)
+        run.wait_for_mesh()
+        os.kill(run.nodes()["mesher"][0], signal.SIGKILL)
+        code, _, err = run.end()
+        assert code == 1
+        assert "mesher was killed by SIGKILL; the end of run/logs/mesher.log:" in err
+        assert "ready" in err.partition("mesher.log:")[2]
+        assert run.nodes() == {}
+
+    @pytest.mark.slow
+    def test_runs_side_by_side_do_not_mix(self, tmp_path, capsys):
+        arguments = ("--threshold", "0.3", "--walks", "0", "--json", "--output", "run")
+        runs = []
+        for name in ("one", "two"):
+            (tmp_path / name).mkdir()
+            runs.append(Run(tmp_path / name, *arguments, "--workers", "1"))
+        for run in runs:
+            code, out, err = run.end(120.0)
+            assert code == 0, err
+            namespace = json.loads(out)["namespace"]
+            inspected = run_json(capsys, "inspect", str(run.directory / "run" / "bag"))
+            assert inspected["problems"] == []
+            assert len(inspected["meshes"]) == 1
+            assert {t["name"].rpartition(namespace + "/")[0] for t in inspected["topics"]} == {""}
+            log = (run.directory / "run" / "logs" / "mesher.log").read_text()
+            assert json.loads(out)["mesh_id"] in log

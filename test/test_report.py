@@ -114,7 +114,7 @@ class TestProgress:
     def test_mesh_has_no_time_left_while_it_grows(self):
         mesh = MeshProgress()
         text = mesh.text(generation=1, states=11, frontier=10, swings_per_second=0.0)
-        assert text == "mesh: 11 states, 10 to explore in generation 1, 0 swings/s, still growing"
+        assert text == "mesh: 11 states, frontier 10, 0 swings/s, still growing"
         text = mesh.text(generation=2, states=111, frontier=100, swings_per_second=50.0)
         assert "still growing" in text
 
@@ -128,9 +128,10 @@ class TestProgress:
             generation=2, states=151, frontier=20, swings_per_second=10.0, simulators=2
         )
         assert text == (
-            "mesh: 151 states, 20 to explore in generation 2, 10 swings/s, about 7.0 s left, "
-            "2 simulators"
+            "mesh: 151 states, frontier 20, 10 swings/s, about 7.0 s left, 2 simulators"
         )
+        text = mesh.text(generation=2, states=151, frontier=0, swings_per_second=10.0)
+        assert text == "mesh: 151 states, frontier 0, 10 swings/s, finishing"
 
 
 class TestTables:
@@ -166,8 +167,9 @@ class TestTables:
     def test_difference(self):
         assert difference(110.0, 100.0) == "+10.0 %"
         assert difference(97.5, 100.0) == "-2.5 %"
-        assert difference(1e9, 1.0) == "+1.00e+11 %"
-        assert difference(math.inf, 1.0) == "+inf %"
+        assert difference(1.6e14, 1e9) == "x 1.600e+05"
+        assert difference(1.0, 2000.0) == "x 5.000e-04"
+        assert difference(math.inf, 1.0) == "x inf"
 
 
 class TestPaper:

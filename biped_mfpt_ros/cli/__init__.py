@@ -75,9 +75,9 @@ def _run(args: argparse.Namespace) -> int:
     except BrokenPipeError:
         raise
     except InputError as error:
-        field = option_of(error.field, vars(args))
-        problem = InputError(field, error.value, error.allowed)
-        print(f"{args.parser.prog}: error: {problem}", file=sys.stderr)
+        problem = str(error).removeprefix(error.field)
+        option = option_of(error.field, vars(args))
+        print(f"{args.parser.prog}: error: {option}{problem}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except Exception as error:
         # Errors of our own classes, and those of files, say what is wrong. Any other is a bug.
@@ -89,6 +89,7 @@ def _run(args: argparse.Namespace) -> int:
 
 # Fields of the core that are not called as the options that set them.
 _OPTIONS = {
+    "bag": "BAG",
     "mu_s_deg": "--mean",
     "sigma_s_deg": "--sigma",
     "states": "--state",

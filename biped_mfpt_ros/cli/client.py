@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import rclpy
 from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MeshProgress as MeshProgressMsg
@@ -149,7 +150,9 @@ class Client:
         self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]
     ) -> list[MfptEstimate]:
         """Ask the analysis for the MFPT of a mesh at any ``sigma_s``."""
-        request = ComputeMfpt.Request(mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(sigma_s, "d"))
+        request = ComputeMfpt.Request(
+            mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array(sigma_s), "d")
+        )
         response = self._result(self._compute.call_async(request))
         if not response.success:
             raise CommandError(f"the analysis failed: {response.message}")

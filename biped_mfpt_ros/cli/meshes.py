@@ -62,7 +62,7 @@ def mfpt(args: argparse.Namespace) -> None:
             estimate_row(args.controller, args.mean, sigma_deg, found, found.failure_shares)
         )
     result |= {
-        "mean_slope": mean,
+        "mu_s": mean,
         "estimates": estimates,
         "chain_seconds": time.perf_counter() - start,
     }

@@ -29,9 +29,15 @@ def node(args: argparse.Namespace) -> int:
     return main() or 0
 
 
-def require_ros() -> None:
-    """Raise CommandError, with the way to set it up, if there is no ROS or no messages."""
-    for module in ("rclpy", "biped_mfpt_msgs.msg"):
+def require_ros(*modules: str) -> None:
+    """Raise CommandError, with the way to set them up, if rclpy or the messages are missing.
+
+    Parameters
+    ----------
+    *modules : str
+        The modules that are needed, if not both.
+    """
+    for module in modules or ("rclpy", "biped_mfpt_msgs.msg"):
         try:
             importlib.import_module(module)
         except ImportError as error:

@@ -418,10 +418,24 @@ run bit for bit.
 
 examples:
   biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag
+  biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag --sigma 0.5 1 1.5 2 --mean -1 --json
 """,
         "output",
     )
     inspect.add_argument("bag", metavar="BAG", help="directory of a bag, or its .mcap file")
+    inspect.add_argument(
+        "--sigma",
+        type=_number,
+        nargs="+",
+        metavar="DEG",
+        help="degrees, standard deviations of the slope (default: those that were published)",
+    )
+    inspect.add_argument(
+        "--mean",
+        type=_number,
+        metavar="DEG",
+        help="degrees, mean slope to go with --sigma (default: 0)",
+    )
 
     add(
         "controllers",

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> None:
         "slope_step_deg": args.slope_step,
         "slope_limit_deg": args.slope_limit,
         "slopes": len(slopes),
-        "mean_slope": mean,
+        "mu_s": mean,
     }
     picture = directory / "mfpt.png"
     with Progress(quiet=args.quiet) as progress, Processes(directory / "logs") as processes:
@@ -156,7 +156,9 @@ class _Pipeline:
     def _node(self, name: str, executable: str, last: bool = False, **parameters: object) -> None:
         command = [sys.executable, "-m", "biped_mfpt_ros.cli", "node", executable]
         command[-1:-1] = ["--end-with", str(os.getpid())]
-        command += ["--ros-args", "-r", f"__ns:={self._namespace}", "--disable-external-lib-logs"]
+        # The log's topic is the same for all nodes on the graph, if it is not brought in here.
+        command += ["--ros-args", "-r", f"__ns:={self._namespace}", "-r", "/rosout:=rosout"]
+        command += ["--disable-external-lib-logs"]
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         environment = os.environ | {"RCUTILS_COLORIZED_OUTPUT": "0", "PYTHONUNBUFFERED": "1"}
@@ -202,7 +204,7 @@ class _Pipeline:
                     _estimate(estimate, sigma_deg, settings.controller.name, mean)
                     for estimate, sigma_deg in zip(estimates, sigmas.values(), strict=True)
                 ],
-                "curve": [{"sigma": e.sigma_s, "mfpt": e.mfpt} for e in curve],
+                "curve": [{"sigma_s": e.sigma_s, "mfpt": e.mfpt} for e in curve],
             }
 
     def _up(self, client: Any) -> bool:
@@ -241,18 +243,18 @@ def _walks(
             continue
         found = monte_carlo(
             controller,
-            row["sigma"],
+            row["sigma_s"],
             args.walks,
             args.seed,
             mu_s=mean,
             model=model,
-            progress=_counting(progress, f"Monte Carlo at sigma {row['sigma_deg']:g} deg"),
+            progress=_counting(progress, f"Monte Carlo at sigma {row['sigma_s_deg']:g} deg"),
         )
         out.append(
-            {"sigma": row["sigma"], "sigma_deg": row["sigma_deg"]}
+            {"sigma_s": row["sigma_s"], "sigma_s_deg": row["sigma_s_deg"]}
             | {"walks": args.walks, "seed": args.seed}
             | monte_carlo_result(found)
-            | {"paper": paper.monte_carlo(controller.name, args.mean, row["sigma_deg"])}
+            | {"paper": paper.monte_carlo(controller.name, args.mean, row["sigma_s_deg"])}
         )
     return out
 
@@ -277,7 +279,7 @@ def _draw(
         controller, state, math.radians(args.mean), math.radians(sigma_deg), _PICTURE_STEPS, model
     )
     points = [
-        (row["sigma_deg"], row["paper"], kind)
+        (row["sigma_s_deg"], row["paper"], kind)
         for kind, rows in (("mesh", result["estimates"]), ("Monte Carlo", result["monte_carlo"]))
         for row in rows
         if row["paper"] is not None
@@ -287,11 +289,11 @@ def _draw(
         f"{controller.name} on rough ground",
         walking,
         f"a walk on slopes with a standard deviation of {sigma_deg:g}°",
-        np.degrees([point["sigma"] for point in result["curve"]]),
+        np.degrees([point["sigma_s"] for point in result["curve"]]),
         np.array([point["mfpt"] for point in result["curve"]]),
         points,
         [
-            (row["sigma_deg"], row["mean_steps"], *row["confidence_interval"])
+            (row["sigma_s_deg"], row["mean_steps"], *row["confidence_interval"])
             for row in result["monte_carlo"]
         ],
     )
@@ -311,7 +313,7 @@ def _report(result: dict[str, Any]) -> str:
             reference = row["paper"]
             rows.append(
                 (
-                    f"{row['sigma_deg']:g} deg",
+                    f"{row['sigma_s_deg']:g} deg",
                     row["mean_steps"],
                     f"{number(low)} to {number(high)}",
                     reference,

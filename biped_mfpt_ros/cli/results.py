@@ -25,13 +25,13 @@ def monte_carlo_result(result: MonteCarlo) -> dict[str, Any]:
     }
 
 
-def shares(values: Mapping[int, float]) -> dict[str, float]:
+def shares(values: Mapping[Any, float]) -> dict[str, float]:
     """Failure shares (by outcome code) by the outcome's name, for JSON, the largest first."""
     ordered = sorted(values.items(), key=lambda item: -item[1])
     return {Outcome(code).name.lower(): share for code, share in ordered if share > 0.0}
 
 
-def shares_table(values: Mapping[int, float]) -> str:
+def shares_table(values: Mapping[Any, float]) -> str:
     """Failure shares for readers."""
     rows = [
         (name.replace("_", " "), f"{100.0 * share:.1f} %") for name, share in shares(values).items()
@@ -40,12 +40,12 @@ def shares_table(values: Mapping[int, float]) -> str:
 
 
 def estimate_row(
-    controller: str, mean_deg: float, sigma_deg: float, found: Any, falls: Mapping[int, float]
+    controller: str, mean_deg: float, sigma_deg: float, found: Any, falls: Mapping[Any, float]
 ) -> dict[str, Any]:
     """An estimate of the MFPT, for JSON; ``found`` has mfpt, failure_probability, lambda_2."""
     return {
-        "sigma": math.radians(sigma_deg),
-        "sigma_deg": sigma_deg,
+        "sigma_s": math.radians(sigma_deg),
+        "sigma_s_deg": sigma_deg,
         "mfpt": found.mfpt,
         "failure_probability": found.failure_probability,
         "lambda_2": found.lambda_2,
@@ -63,7 +63,7 @@ def mfpt_table(estimates: Sequence[dict[str, Any]]) -> str:
         reference = row["paper"]
         rows.append(
             (
-                f"{row['sigma_deg']:g} deg",
+                f"{row['sigma_s_deg']:g} deg",
                 row["mfpt"],
                 reference,
                 "" if reference is None else difference(row["mfpt"], reference),

@@ -109,7 +109,7 @@ def monte_carlo(args: argparse.Namespace) -> None:
         print(
             json_text(
                 options.described(controller, model)
-                | {"mean_slope": mean, "sigma": sigma, "walks": args.walks, "seed": args.seed}
+                | {"mu_s": mean, "sigma_s": sigma, "walks": args.walks, "seed": args.seed}
                 | monte_carlo_result(result)
                 | {"max_steps": args.max_steps, "seconds": seconds, "paper": reference}
             )

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -149,7 +150,7 @@ def example_walk(
     for seed in range(20):
         random = np.random.default_rng(seed)
         slopes = np.clip(mu_s + sigma_s * random.standard_normal(steps), -SLOPE_LIMIT, SLOPE_LIMIT)
-        found = walk(controller, state, slopes, model)
+        found = walk(controller, state, slopes.tolist(), model)
         if best is None or found.steps[-1] > best.steps[-1]:
             best = found
         if best.steps[-1] == steps - 1:
@@ -174,7 +175,7 @@ def draw_walk(axes: Axes, walking: Walk) -> None:
         legs = (_STANCE, _SWING) if step % 2 == 0 else (_SWING, _STANCE)
         strong = i in (0, last)
         alpha, width = (0.95, 2.2) if strong else (0.45, 1.1)
-        style = {"alpha": alpha, "linewidth": width, "solid_capstyle": "round"}
+        style: dict[str, Any] = {"alpha": alpha, "linewidth": width, "solid_capstyle": "round"}
         axes.plot(*points[[0, 1, 2]].T, color=legs[0], solid_joinstyle="round", **style)
         axes.plot(*points[[5, 4, 2]].T, color=legs[1], solid_joinstyle="round", **style)
         axes.plot(*points[[2, 3]].T, color=_BODY, **style)

@@ -153,11 +153,11 @@ class MeshProgress:
         if generation != self._generation:
             self._previous_size, self._size = self._size, frontier
             self._generation = generation
-        parts = [
-            f"mesh: {states} states, {frontier} to explore in generation {generation}",
-            f"{rate_text(swings_per_second)} swings/s",
-        ]
-        if 0 < self._size < self._previous_size and swings_per_second > 0.0:
+        parts = [f"mesh: {states} states", f"frontier {frontier}"]
+        parts.append(f"{rate_text(swings_per_second)} swings/s")
+        if frontier == 0:
+            parts.append("finishing")
+        elif 0 < self._size < self._previous_size and swings_per_second > 0.0:
             factor = self._size / self._previous_size
             swings = frontier + self._size * factor / (1.0 - factor)
             parts.append(f"about {duration_text(swings / swings_per_second)} left")

@@ -57,6 +57,6 @@ def number(value: object) -> str:
 
 
 def difference(value: float, reference: float) -> str:
-    """Difference from a reference in percent, such as ``"+3.2 %"``."""
-    percent = 100.0 * (value / reference - 1.0)
-    return f"{percent:+.1f} %" if abs(percent) < 1000.0 else f"{percent:+.2e} %"
+    """Difference from a reference, such as ``"+3.2 %"``, or ``"x 1500"`` beyond a factor of 10."""
+    ratio = value / reference
+    return f"{100.0 * (ratio - 1.0):+.1f} %" if 0.1 <= ratio <= 10.0 else f"x {number(ratio)}"

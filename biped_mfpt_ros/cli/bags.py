@@ -1,0 +1,72 @@
+"""`biped-mfpt inspect`: what a bag holds, and its MFPT from the bag alone."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from typing import TYPE_CHECKING
+
+from biped_mfpt_ros.cli import EXIT_FAILED, options
+from biped_mfpt_ros.cli.node import require_ros
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.report.progress import duration_text
+from biped_mfpt_ros.report.tables import table
+
+if TYPE_CHECKING:
+    from biped_mfpt_ros.bag.report import BagReport, MeshReport
+
+
+def inspect(args: argparse.Namespace) -> int:
+    """Report on a bag; fails if anything in it is missing or does not come out again."""
+    sigmas = args.sigma and [options.spread("--sigma", sigma) for sigma in args.sigma]
+    mean = None if args.mean is None else options.slope("--mean", args.mean)
+    if mean is not None and not sigmas:
+        raise InputError("--sigma", None, "at least one standard deviation to go with --mean")
+    require_ros("biped_mfpt_msgs.msg")
+    from biped_mfpt_ros.bag.report import inspect_bag
+
+    report = inspect_bag(args.bag, sigmas, mean)
+    print(json_text(report.to_dict()) if args.json else _text(report))
+    return EXIT_FAILED if report.problems or not report.identical else 0
+
+
+def _text(report: BagReport) -> str:
+    recorded = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(report.start))
+    parts = [
+        f"{report.path}: {report.messages} messages in {duration_text(report.duration)}, "
+        f"{report.bytes / 1e6:.3g} MB, recorded {recorded}",
+        table(
+            ("topic", "messages", "missing", "repeated"),
+            [(t.name, t.messages, t.missing, t.repeated) for t in report.topics],
+        ),
+        *map(_mesh_text, report.meshes),
+    ]
+    if report.problems:
+        parts.append("\n".join(["not as it should be:", *(f"- {p}" for p in report.problems)]))
+    return "\n\n".join(parts)
+
+
+def _mesh_text(mesh: MeshReport) -> str:
+    parts = [f"mesh {mesh.mesh_id}: {mesh.status}"]
+    if mesh.problem:
+        return f"{parts[0]}, cannot be rebuilt: {mesh.problem}"
+    parts.append(
+        f"{mesh.controller}, {mesh.states} states in {mesh.generations} generations, "
+        f"{mesh.slopes} slopes, threshold {mesh.threshold:g}"
+        f"{'' if mesh.clustered else ', unclustered'}, {duration_text(mesh.seconds)}"
+    )
+    rows = [
+        (
+            f"{math.degrees(e.mu_s):g} deg",
+            f"{math.degrees(e.sigma_s):g} deg",
+            repr(e.mfpt),
+            "-" if e.published is None else repr(e.published.mfpt),
+            {True: "yes", False: "no", None: "-"}[e.identical],
+        )
+        for e in mesh.estimates
+    ]
+    if rows:
+        parts.append(table(("mean", "sigma", "MFPT from the bag", "as published", "same"), rows))
+    return "\n".join(parts)
