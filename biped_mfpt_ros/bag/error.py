@@ -36,3 +36,6 @@ class BagWriteError(OSError):
 
     What was flushed before stays readable (see `biped_mfpt_ros.bag.salvage`).
     """
+
+    def __str__(self) -> str:
+        return f"bag {self.filename}: {self.strerror}"

@@ -17,7 +17,7 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
-from rclpy.subscription import MessageInfo, Subscription
+from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from biped_mfpt_ros.bag.definitions import message_definition
@@ -150,7 +150,7 @@ class Recorder(Node):
         )
         self._recordings.append(recording)
 
-    def _record(self, recording: _Recording, data: bytes, info: MessageInfo) -> None:
+    def _record(self, recording: _Recording, data: bytes, info: dict[str, Any]) -> None:
         if self.failed:
             return
         sequence = 0
