@@ -28,6 +28,10 @@ from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 DOMAIN = 1 + os.getpid() % 100
 
 
+STARTING = 120.0
+"""s, for nodes that may have to compile first, several of them on a busy machine."""
+
+
 def wait_for(condition, what, timeout=20.0):
     """Wait until a condition is true, and return what it says."""
     deadline = time.monotonic() + timeout
@@ -160,11 +164,14 @@ class Client(Node):
         (name,) = wait_for(self.simulators, "a simulator")
         return self.service(SimulateSteps, name)
 
+    def wait_for_mesher(self):
+        wait_for(self._grow.server_is_ready, "grow_mesh", STARTING)
+
     def send_goal(self, settings, feedback=None):
         """Handle of a goal; `settings` may be a message that is wrong."""
         if not hasattr(settings, "get_fields_and_field_types"):
             settings = settings_message(settings)
-        wait_for(self._grow.server_is_ready, "grow_mesh")
+        self.wait_for_mesher()
         goal = GrowMesh.Goal(settings=settings)
         callback = None if feedback is None else lambda m: feedback(m.feedback.progress)
         return result_of(self._grow.send_goal_async(goal, feedback_callback=callback))

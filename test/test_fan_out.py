@@ -248,3 +248,4 @@ def test_tick_ends_it_promptly(swings):
     assert simulate.in_flight == FanOutSettings().in_flight
     simulate.close()
     assert len(forgotten) == FanOutSettings().in_flight
+    assert simulate.in_flight == 0

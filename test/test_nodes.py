@@ -256,6 +256,7 @@ def test_mesh_from_the_limit_cycle_is_the_one_grown_here(graph, tester, cycle_st
     for last in (feedback[-1], topic[-1]):
         assert (last.mesh_id, last.states) == (result.mesh_id, result.states)
         assert (last.swings, last.frontier, last.chunks_in_flight) == (result.swings, 0, 0)
+        assert last.simulators == 1
     assert [message.sequence for message in topic] == list(range(len(topic)))
 
 

@@ -262,7 +262,7 @@ class FanOut:
         for simulator in self._simulators.values():
             for asked in simulator.asked.values():
                 asked.forget()
-        self._simulators.clear()
+            simulator.asked.clear()
 
     def _size(self, remaining: int) -> int:
         """Swings of the next chunk: the fewer are left, the smaller, so that all end together."""

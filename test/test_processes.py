@@ -1,0 +1,161 @@
+"""The nodes as processes: the same mesh from any number of simulators, faults, clean stops."""
+
+import signal
+import subprocess
+
+import pytest
+from action_msgs.msg import GoalStatus
+from biped_mfpt_msgs.msg import MfptEstimate
+from ros_graph import STARTING, Client, ros_graph, wait_for
+
+from biped_mfpt_ros.chain.mesh import grow_mesh
+from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.gait.step import simulate_steps
+from biped_mfpt_ros.nodes.messages import MeshSettings
+from biped_mfpt_ros.nodes.qos import RESULTS
+from biped_mfpt_ros.walker.robot import WalkerModel
+from biped_mfpt_ros.walker.terrain import slope_set
+
+
+@pytest.fixture(scope="module")
+def graph():
+    with ros_graph() as graph:
+        yield graph
+
+
+@pytest.fixture(scope="module")
+def client(graph):
+    return graph.start(Client)
+
+
+def settings(name, threshold):
+    return MeshSettings(controller(name), WalkerModel(), slope_set(0.5), threshold)
+
+
+def grown_here(settings):
+    return grow_mesh(
+        lambda states, previous: simulate_steps(
+            settings.controller, states, previous, settings.slopes, settings.model
+        ),
+        find_limit_cycle(settings.controller).state,
+        settings.slopes,
+        settings.threshold,
+    )
+
+
+def assert_same_mesh(a, b):
+    for name in ("states", "preceding", "generation", "targets", "outcomes", "scales"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+
+
+def stop(process, number):
+    """Exit code and what was written to stderr, after a signal."""
+    process.send_signal(number)
+    try:
+        _, written = process.communicate(timeout=10.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        pytest.fail(f"still running 10 s after signal {number}: {process.communicate()[1]}")
+    return process.returncode, written
+
+
+def simulators(graph, client, count):
+    """Start simulators until there are so many; all processes that have been started."""
+    before = len(client.simulators())
+    started = [graph.launch("simulator") for _ in range(count - before)]
+    wait_for(lambda: len(client.simulators()) == count, f"{count} simulators", STARTING)
+    return started
+
+
+# Small chunks, so that small meshes keep several simulators busy.
+MESHER = ("--ros-args", "-p", "chunk_seconds:=0.001", "-p", "simulator_timeout:=0.3",
+          "-p", "progress_period:=0.05", "-p", "simulator_wait_seconds:=30.0")  # fmt: skip
+
+
+def test_pipeline_of_processes(graph, client):
+    """One story, since starting processes takes seconds."""
+    estimates = []
+    client.create_subscription(MfptEstimate, "mfpt", estimates.append, RESULTS)
+    others = [
+        graph.launch("mesher", *MESHER),
+        graph.launch("analysis", "--ros-args", "-p", "sigma_s_deg:=[1]"),
+    ]
+    client.wait_for_mesher()
+    base = settings("hzd/base", 0.3)
+    here = grown_here(base)
+    started = []
+    published = []
+    for count in (1, 2, 4):
+        started += simulators(graph, client, count)
+        seen = []
+
+        # The mesher looks for simulators on its own; a mesh may begin before it has found all.
+        def grown_by_all(count=count, seen=seen):
+            seen.clear()
+            status, result = client.grow(base, seen.append)
+            assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+            published.append(result.mesh_id)
+            assert_same_mesh(client.mesh(result.mesh_id), here)
+            return seen[-1].simulators == count
+
+        wait_for(grown_by_all, f"a mesh grown by {count} simulators")
+    wait_for(lambda: len(estimates) == len(published), "an estimate for every mesh")
+    assert [estimate.mesh_id for estimate in estimates] == published
+    assert len({estimate.mfpt for estimate in estimates}) == 1
+
+    # A simulator that is stopped takes requests and does not answer; then it is killed.
+    finer = settings("hzd/base", 0.03)
+    victim, woken, *_ = started
+    victim.send_signal(signal.SIGSTOP)
+    woken.send_signal(signal.SIGSTOP)
+    handle = client.send_goal(finer, seen.append)
+    seen.clear()
+    wait_for(lambda: seen and seen[-1].chunks_repeated, "chunks to be handed on")
+    victim.kill()
+    woken.send_signal(signal.SIGCONT)
+    status, result = client.outcome(handle)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert result.chunks_repeated > 0
+    assert result.swings == result.states - 1
+    assert_same_mesh(client.mesh(result.mesh_id), grown_here(finer))
+
+    # A mesh that is being grown does not keep anyone from stopping cleanly.
+    handle = client.send_goal(settings("hzd/mfpt", 0.001), seen.append)
+    seen.clear()
+    wait_for(lambda: seen and seen[-1].swings > 100, "the mesh to grow")
+    running = [*others, *(process for process in started if process is not victim)]
+    for number, process in zip((signal.SIGTERM, signal.SIGINT) * 3, running, strict=False):
+        code, written = stop(process, number)
+        assert code == 0, written
+        assert "Traceback" not in written
+
+
+def test_nodes_that_cannot_start_say_why(graph):
+    """Bad parameters, and security that is asked for where there is none."""
+    cases = [
+        (graph.launch("simulator", "--ros-args", "-p", "max_states:=0"), "max_states: 0 is not"),
+        (graph.launch("analysis", "--ros-args", "-p", "sigma_s_deg:=[0.0]"), "sigma_s_deg[0]: 0.0"),
+        (graph.launch("mesher", ROS_SECURITY_ENABLE="true"), "ROS_SECURITY_STRATEGY: 'Permissive'"),
+        (
+            graph.launch("mesher", ROS_SECURITY_ENABLE="true", ROS_SECURITY_STRATEGY="Enforce"),
+            "ROS_SECURITY_ENABLE: 'true' is not allowed",
+        ),
+    ]
+    for process, said in cases:
+        _, written = process.communicate(timeout=60.0)
+        assert process.returncode == 2
+        assert said in written
+        assert "; allowed: " in written
+        assert "Traceback" not in written
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_the_start_stops_cleanly(graph, client, number):
+    process = graph.launch("simulator")
+    # The node is on the graph before its kernels are loaded, or compiled.
+    name = f"_{process.pid}"
+    wait_for(lambda: any(node.endswith(name) for node in client.get_node_names()), "the node")
+    code, written = stop(process, number)
+    assert code == 0, written
+    assert "Traceback" not in written
