@@ -491,6 +491,7 @@ def test_foreign_or_broken_bag_is_a_clear_error(tmp_path, case):
         list(Bag(tmp_path / "bag").messages())
     assert text in str(raised.value)
     assert str(tmp_path / "bag") in str(raised.value)
+    assert str(raised.value).count("allowed:") == 1
     assert raised.value.field == "bag"
 
 
@@ -522,6 +523,14 @@ def test_definition_that_does_not_fit_its_hash_is_refused(tmp_path):
         writer.write("/mesh/states", states_message(0), 0, 0)
     with pytest.raises(BagError, match="not the one its hash is of"):
         list(Bag(tmp_path / "bag").messages())
+
+
+def test_message_without_fields_is_read(tmp_path):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/tick", "test_msgs/msg/Empty", "")
+        writer.write("/tick", b"\0\1\0\0\0", 0, 0)
+    (read,) = Bag(tmp_path / "bag").messages()
+    assert read.type_name == "test_msgs/msg/Empty"
 
 
 @pytest.mark.parametrize("data", [b"", b"\0\1\0\0", states_message(3)[:-4], b"\xff" * 99])

@@ -177,6 +177,8 @@ def read_metadata(directory: Path) -> Metadata:
         raise BagError(path, f"is not of a bag: it has no {_ROOT}")
     try:
         return _from_dict(content[_ROOT], path)
+    except BagError:
+        raise
     except KeyError as error:
         raise BagError(path, f"has no {error.args[0]}") from None
     except (TypeError, ValueError, AttributeError, IndexError) as error:

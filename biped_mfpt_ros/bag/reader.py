@@ -290,10 +290,10 @@ class Bag:
     def _learn(self, schema: Schema, channel: Channel) -> None:
         """Learn the types of a schema, once."""
         text = schema.data.decode(errors="replace")
-        known = self._types.setdefault(schema.name, "")
+        known = self._types.get(schema.name)
         if known == text:
             return
-        if known:
+        if known is not None:
             raise BagError(self.path, f"has two different definitions of {schema.name}")
         if schema.encoding != "ros2msg" or channel.message_encoding != "cdr":
             raise BagError(
