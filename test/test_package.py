@@ -56,13 +56,15 @@ def requirements(name):
 def imports(folder):
     """Top-level names that the modules under a folder import from elsewhere."""
     names = set()
-    for path in (ROOT / folder).rglob("*.py"):
+    paths = list((ROOT / folder).rglob("*.py"))
+    own = {PACKAGE, *(path.stem for path in paths if path.parent == ROOT / folder)}
+    for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 names.update(alias.name.split(".")[0] for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 names.add(node.module.split(".")[0])
-    return {name for name in names if name not in sys.stdlib_module_names and name != PACKAGE}
+    return names - own - sys.stdlib_module_names
 
 
 def test_version_is_the_same_everywhere():
