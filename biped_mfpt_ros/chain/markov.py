@@ -9,23 +9,30 @@ Summing that equation gives
 
     1 - lambda_2 = sum of phi_i f_i,
 
-a sum of products that are not negative, so it is as accurate at 1e-100 as at 0.1. Nothing in this
-file subtracts a probability from one. It asks more of phi than a small norm of its error: falls
-may come from states with phi_i = 1e-20, so every component has to be right relative to itself.
+a sum of products that are not negative, so it is as accurate at 1e-100 as at 0.1. No failure
+probability is ever found by subtraction. It asks more of phi than a small norm of its error:
+falls may come from states with phi_i = 1e-20, so every component has to be right relative to
+itself.
 
 Iteration
-    phi is the limit of the distribution after k steps from x_2, given no fall so far. It is made
-    of sums of products that are not negative, and so accurate in every component. Every state
-    gets its weight by flow from x_2. A slow part of the chain shows: while it still fills, its
-    weight changes by 1/k or more in step k; after that, what is missing of it after k steps is
-    at most about k times what step k changed. Hence the rule to stop: k times the largest
-    relative change is within the tolerance. A state that lost weight to below what could matter
-    for the sum above is left out, but one that gains never is.
+    phi is the limit of the distribution after k steps, given no fall so far. It is made of sums of
+    products that are not negative, and so accurate in every component. The steps start from a
+    likely state, and every other state gets its weight by flow from there. So a slow part of the
+    chain shows: while it still fills, its weight changes by 1/k or more in step k; after that,
+    what is missing of it after k steps is at most about k times what step k changed. Hence the
+    rule to stop: k times the largest relative change is within the tolerance. A state that lost
+    weight to below what could matter for the sum above is left out, but one that gains never is.
 
-Elimination
+Squaring
     Chains that mix too slowly for that (walkers with several gaits and rare changes between
-    them), or that have a long period, are solved by elimination without subtractions [1]_ [2]_.
-    Rows of I - Q are kept as off-diagonals and row sums f_i, and a diagonal is the sum of these.
+    them), that have a long period, or several closed parts, are solved if they are small: the
+    matrix of 2^k steps is squared until it settles, again from what is not negative. The falls
+    in 2^k steps are carried along, so that rounding in what survives passes neither for falls nor
+    for gain.
+
+The mean first-passage times from each state, (I - Q)^-1 1, are iterated in the same way, or found
+by elimination without subtractions [1]_ [2]_: rows of I - Q are kept as off-diagonals and row sums
+f_i, and the diagonal is the sum of these.
 
 References
 ----------
@@ -33,8 +40,6 @@ References
    distributions for Markov chains", Operations Research 33 (1985).
 .. [2] A. S. Alfa, J. Xue, Q. Ye, "Accurate computation of the smallest eigenvalue of a diagonally
    dominant M-matrix", Mathematics of Computation 71 (2002).
-.. [3] T. Noda, "Note on the computation of the maximal eigenvalue of a non-negative irreducible
-   matrix", Numerische Mathematik 17 (1971).
 """
 
 from __future__ import annotations
@@ -55,20 +60,23 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.walker.terrain import check_slopes
 
-ELIMINATION_LIMIT = 2000
-"""Most states that are solved by elimination; time grows with the cube, memory with the square."""
+DENSE_LIMIT = 2000
+"""Most states of a chain that is not iterated; time grows with the cube, memory with the square."""
 
 TOLERANCE = 1e-12
 """Relative accuracy aimed at, in the MFPT and in every state's weight."""
 
 _PLAIN_STEPS = 100  # then steps with a share of staying, for periodic chains
 _STEPS = 3000
+_SQUARINGS = 1100  # 2^1100 is more than any MFPT
 # Weights below this may have lost digits to underflow, and are not waited for.
 _UNDERFLOW = 1e-290
+# Largest ratio of the parts of a sum to the sum itself: three of sixteen digits lost.
+_CANCELLATION = 1e3
 
 
 class ChainError(RuntimeError):
-    """The chain mixes too slowly to be iterated and is too large to be eliminated."""
+    """The chain mixes too slowly to be iterated and is too large to be solved otherwise."""
 
 
 # Probabilities, transitions ---------------------------------------------------------------------
@@ -114,10 +122,12 @@ def slope_probabilities(slopes: ArrayLike, mu_s: float, sigma_s: float) -> np.nd
         raise InputError("mu_s", mu_s, f"{slopes[0]:.6g} to {slopes[-1]:.6g} rad, the slope set")
     if not (isinstance(sigma_s, Real) and math.isfinite(sigma_s) and sigma_s > 0.0):
         raise InputError("sigma_s", sigma_s, "a finite number above 0, rad")
+    # Relative to the likeliest slope, so that a narrow density between slopes does not vanish.
+    distances = np.abs(slopes - mu_s)
+    least = distances.min()
     with np.errstate(over="ignore"):
-        exponents = 0.5 * ((slopes - mu_s) / sigma_s) ** 2
-    # From the likeliest slope, so that a narrow density between two slopes does not vanish.
-    weights = np.exp(exponents.min() - exponents)
+        exponents = 0.5 * ((distances - least) * (distances + least)) / sigma_s / sigma_s
+    weights = np.exp(-exponents)
     return weights / weights.sum()
 
 
@@ -244,158 +254,117 @@ def _can_reach(targets, out):
                         break
 
 
-# Elimination ------------------------------------------------------------------------------------
+# Small chains -----------------------------------------------------------------------------------
 
 
-@kernel
-def _eliminate(q, slack, pivots, least):
-    """Factor I - Q, with row sums `slack`, in place and without subtracting; states k-1 to 0.
-
-    The diagonal of `q` is not used. Then q[i, p] for i < p are the multipliers, q[p, j] for j < p
-    the rest of row p when its turn came, and `pivots` the diagonal, at least `least`.
-    """
-    for p in range(q.shape[0] - 1, -1, -1):
-        pivot = slack[p]
-        for j in range(p):
-            pivot += q[p, j]
-        pivots[p] = max(pivot, least)
-        for i in range(p):
-            if q[i, p] != 0.0:
-                q[i, p] /= pivots[p]
-                factor = q[i, p]
-                slack[i] += factor * slack[p]
-                for j in range(p):
-                    q[i, j] += factor * q[p, j]
-
-
-@kernel
-def _solve_left(q, pivots, x):
-    """Replace x by x (I - Q)^-1, from what `_eliminate` left."""
-    for p in range(q.shape[0] - 1, -1, -1):
-        x[p] /= pivots[p]
-        for j in range(p):
-            x[j] += x[p] * q[p, j]
-    for p in range(1, q.shape[0]):
-        for i in range(p):
-            x[p] += x[i] * q[i, p]
-
-
-@kernel
-def _solve_right(q, pivots, x):
-    """Replace x by (I - Q)^-1 x, from what `_eliminate` left."""
-    for p in range(q.shape[0] - 1, 0, -1):
-        for i in range(p):
-            x[i] += q[i, p] * x[p]
-    for p in range(q.shape[0]):
-        for j in range(p):
-            x[p] += q[p, j] * x[j]
-        x[p] /= pivots[p]
-
-
-def _check_size(states: int, why: str) -> None:
-    if states > ELIMINATION_LIMIT:
+def _check_size(states: int) -> None:
+    if states > DENSE_LIMIT:
         raise ChainError(
-            f"the chain does not settle in {_STEPS} steps, and {why} of {states} states is too "
-            f"large to be eliminated (limit {ELIMINATION_LIMIT})"
+            f"the chain does not settle in {_STEPS} steps, and with {states} states it is too "
+            f"large to be solved otherwise (limit {DENSE_LIMIT})"
         )
 
 
-def _escape(q: np.ndarray, slack: np.ndarray) -> tuple[float, np.ndarray]:
-    """Escape rate 1 - lambda and left Perron vector of an irreducible Q, by Noda's iteration [3]_.
+def _squared(q: np.ndarray, falls: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Limit of the distribution after 2^k steps from any of the states `among`, given no fall.
 
-    While the shift is below the escape rate, (I - Q - shift)^-1 has no negative entry, and a step
-    from x to y = x (I - Q - shift)^-1 encloses the rate between the shift plus the least and the
-    shift plus the largest x_i / y_i. The lower bound is the next shift. Taking the shift off the
-    row sums is the only subtraction; its rounding disturbs the vector no more than an error of the
-    same relative size in the row sums does.
+    `falls` is what leaves Q, shape (n,). The limit has to be the same from each of `among`, which
+    are the states of a class, so that the first steps do not decide between slow parts.
     """
-    k = len(q)
-    pivots = np.empty(k)
-    if not slack.any():
-        # No escape. With one from state 0, the visits between two of them are stationary.
-        factors = q.copy()
-        _eliminate(factors, slack.copy(), pivots, 1e-300)
-        pivots[0] = 1.0
-        x = np.zeros(k)
-        x[0] = 1.0
-        _solve_left(factors, pivots, x)
-        return 0.0, x / x.sum()
-    shift = 0.0
-    x = np.full(k, 1.0 / k)
-    for _ in range(100):
-        factors = q.copy()
-        # A shift that is the rate itself to the last digit may leave a last pivot of 0 or below.
-        _eliminate(factors, slack - shift, pivots, max(1e-16 * shift, 1e-290))
-        # A factorisation costs as much as very many solves, but those may converge slowly.
-        for _ in range(20):
-            y = x.copy()
-            _solve_left(factors, pivots, y)
-            counts = x > _UNDERFLOW
-            ratios = x[counts] / y[counts]
-            low, high = shift + ratios.min(), shift + ratios.max()
-            x = y / y.sum()
-            if high - low <= TOLERANCE * high:
-                return 0.5 * (low + high), x
-        shift = low
-    raise ChainError(f"the escape rate of {k} states stays between {low:.15g} and {high:.15g}")
+    n = len(q)
+    # With every other step one of staying there are no periods.
+    power, left = 0.5 * (q + np.eye(n)), 0.5 * falls
+    x = np.full(n, 1.0 / n)
+    for _ in range(_SQUARINGS):
+        power, left = power @ power, left + power @ left
+        survives = power.sum(axis=1)
+        rare = left < 0.5
+        power[rare] *= ((1.0 - left[rare]) / survives[rare])[:, np.newaxis]
+        if survives.max() < 1e-100:
+            power /= survives.max()
+        rows = power[among] / power[among].sum(axis=1)[:, np.newaxis]
+        previous, x = x, rows[0]
+        floor = TOLERANCE / n * float(x @ falls)
+        # A slow part that still fills doubles its weight, what is missing of it is squared.
+        counts = (x > _UNDERFLOW) & ((x > previous) | (x > floor))
+        if (np.abs(previous - x)[counts] <= TOLERANCE * x[counts]).all():
+            counts = (x > _UNDERFLOW) & (x > floor)
+            if (np.abs(rows - x)[:, counts] <= TOLERANCE * x[counts]).all():
+                return x
+    raise ChainError(f"a chain of {n} states does not settle in 2^{_SQUARINGS} steps")
 
 
-def _eliminated_distribution(
-    targets: np.ndarray, probabilities: np.ndarray, start: int
-) -> np.ndarray:
-    """Metastable distribution by elimination, class by class of states that reach each other.
+def _dense_distribution(targets: np.ndarray, probabilities: np.ndarray, start: int) -> np.ndarray:
+    """Metastable distribution of a small chain, from its classes of states that reach each other.
 
-    lambda_2 is the largest of the classes' eigenvalues. Its left eigenvector is 0 on states that
-    the class cannot be left for, the class's own Perron vector in it, and follows from that on
-    the states further down.
+    lambda_2 is the largest of the classes' eigenvalues, and phi the limit of the distribution
+    from a state of that class.
     """
     n = len(targets)
-    matrix = transition_matrix(targets, probabilities)
-    reached = np.flatnonzero(_mark_reachable(targets, start))
-    reached = reached[reached != 0]
-    _, labels = connected_components(matrix[reached][:, reached], connection="strong")
-    _check_size(int(np.bincount(labels).max()), "a class")
-    label_of = np.full(n, -1)
-    label_of[reached] = labels
-    entries = matrix.tocoo()
-    rows, columns = entries.coords
-    leaves = label_of[rows] != label_of[columns]
-    outflow = np.bincount(rows[leaves], entries.data[leaves], minlength=n)
-
-    by_label = reached[np.argsort(labels, kind="stable")]
-    classes = np.split(by_label, np.cumsum(np.bincount(labels))[:-1])
-    vectors = []
+    reached = _mark_reachable(targets, start)
+    reached[0] = False
+    members = np.flatnonzero(reached)
+    _check_size(len(members))
+    # Rows of the members; column 0 is the falls.
+    matrix = transition_matrix(targets, probabilities).toarray()
+    count, labels = connected_components(
+        csr_array(matrix[np.ix_(members, members)] > 0.0), connection="strong"
+    )
+    classes = [members[labels == label] for label in range(count)]
     keys = []
-    for members in classes:
-        block = matrix[members][:, members].toarray()
-        rate, vector = _escape(block, outflow[members])
-        vectors.append(vector)
+    for states in classes:
+        others = np.ones(n, dtype=np.bool_)
+        others[states] = False
+        leaves = matrix[np.ix_(states, others)].sum(axis=1)
+        q = matrix[np.ix_(states, states)]
+        x = _squared(q, leaves, np.arange(len(states))) if q.any() else np.ones(1)
         # Near 1 the rates no longer tell small eigenvalues apart; what stays does.
-        keys.append((rate, -float((vector @ block).sum())))
-    best = min(range(len(classes)), key=keys.__getitem__)
+        keys.append((float(x @ leaves), -float((x @ q).sum())))
+    best = min(range(count), key=keys.__getitem__)
     while True:
         below = _mark_reachable(targets, int(classes[best][0]))
-        below[0] = False
-        below[classes[best]] = False
         # Of equal classes one behind the other, the last one keeps all the weight.
-        ties = [c for c, key in enumerate(keys) if key == keys[best] and below[classes[c][0]]]
-        if not ties:
+        ties = [c for c in range(count) if c != best and keys[c] == keys[best]]
+        behind = [c for c in ties if below[classes[c][0]]]
+        if not behind:
             break
-        best = ties[0]
+        best = behind[0]
+    below[0] = False
+    states = np.flatnonzero(below)
+    q = matrix[np.ix_(states, states)]
+    x = np.ones(1)
+    if q.any():
+        x = _squared(q, matrix[states, 0], np.searchsorted(states, classes[best]))
+    out = np.zeros(n)
+    out[states] = x
+    return out
 
-    x = np.zeros(n)
-    x[classes[best]] = vectors[best]
-    rest = np.flatnonzero(below)
-    if len(rest):
-        _check_size(len(rest), "the part behind the slowest class")
-        rate = keys[best][0]
-        factors, pivots = matrix[rest][:, rest].toarray(), np.empty(len(rest))
-        slack = matrix[rest][:, [0]].toarray().ravel() - rate
-        _eliminate(factors, slack, pivots, max(1e-16 * rate, 1e-290))
-        inflow = vectors[best] @ matrix[classes[best]][:, rest]
-        _solve_left(factors, pivots, inflow)
-        x[rest] = inflow
-    return x / x.sum()
+
+@kernel
+def _eliminate(q, falls, x):
+    """Replace x by (I - Q)^-1 x without subtracting; `q` and `falls` are used up.
+
+    The diagonal of `q` is not read. States are eliminated from the last to the first: a visit to
+    one is followed on to where it leads among those that are left, or to the fall.
+    """
+    for p in range(q.shape[0] - 1, -1, -1):
+        leaves = falls[p]
+        for j in range(p):
+            leaves += q[p, j]
+        for j in range(p):
+            q[p, j] /= leaves
+        falls[p] /= leaves
+        x[p] /= leaves
+        for i in range(p):
+            share = q[i, p]
+            if share != 0.0:
+                falls[i] += share * falls[p]
+                x[i] += share * x[p]
+                for j in range(p):
+                    q[i, j] += share * q[p, j]
+    for p in range(1, q.shape[0]):
+        for j in range(p):
+            x[p] += q[p, j] * x[j]
 
 
 def _eliminated_times(
@@ -403,12 +372,10 @@ def _eliminated_times(
 ) -> np.ndarray:
     """Mean first-passage times of the states `among`, which lead only to each other and to 0."""
     members = np.flatnonzero(among)
-    _check_size(len(members), "a part")
+    _check_size(len(members))
     rows = transition_matrix(targets, probabilities)[members]
-    factors, pivots = rows[:, members].toarray(), np.empty(len(members))
-    _eliminate(factors, rows[:, [0]].toarray().ravel(), pivots, 1e-300)
     times = np.ones(len(members))
-    _solve_right(factors, pivots, times)
+    _eliminate(rows[:, members].toarray(), rows[:, [0]].toarray().ravel(), times)
     out = np.zeros(len(targets))
     out[members] = times
     return out
@@ -428,7 +395,12 @@ Floor = Callable[[np.ndarray, float], float]
 
 
 def _iterate(
-    step: Step, targets: np.ndarray, probabilities: np.ndarray, start: int, floor: Floor
+    step: Step,
+    targets: np.ndarray,
+    probabilities: np.ndarray,
+    start: int,
+    floor: Floor,
+    tolerance: float = TOLERANCE,
 ) -> np.ndarray | None:
     """Repeat a step from `start`, scaled to sum 1, until it settles; None if it does not.
 
@@ -447,9 +419,50 @@ def _iterate(
         stay = 0.0 if k <= _PLAIN_STEPS else 0.5 * total
         change = _settle(x, out, stay, floor(out, total))
         # Two in a row, as parts that oscillate may stand still for a moment.
-        if k * max(change, previous) <= TOLERANCE:
+        if k * max(change, previous) <= tolerance:
             return x
         previous = change
+    return None
+
+
+def _iterated_distribution(
+    targets: np.ndarray, probabilities: np.ndarray, start: int, endless: bool
+) -> np.ndarray | None:
+    """Metastable distribution by iteration, None if it does not settle.
+
+    The state `start` may never be visited again, and its first steps may share weight out
+    between parts of the chain in a way that later steps are too slow to put right. So it only
+    finds the likeliest state, and phi is iterated from there: whatever part is not in balance
+    with a state that is always visited is seen to fill.
+    """
+    n = len(targets)
+
+    def floor(out: np.ndarray, total: float) -> float:
+        return TOLERANCE / n * (1.0 if endless else float(out[0]) / (float(out[0]) + total))
+
+    rough = _iterate(_step_forward, targets, probabilities, start, floor, tolerance=1e-3)
+    if rough is None:
+        return None
+    likeliest = int(np.argmax(rough))
+    phi = _iterate(_step_forward, targets, probabilities, likeliest, floor)
+    if phi is None or n * phi[likeliest] < 0.1:
+        return None
+    # No part that is reached from the start, but not from there, may have a larger eigenvalue.
+    aside = _mark_reachable(targets, start) & ~_mark_reachable(targets, likeliest)
+    if not aside.any() or endless:
+        return phi
+    out = np.empty(n)
+    _step_forward(targets, probabilities, phi, out)
+    lambda_2 = float(out[1:].sum())
+    survives = aside.astype(np.float64)
+    bound = 1.0 - 1e-9  # well above what rounding adds to a survival of 1
+    for _ in range(_PLAIN_STEPS if lambda_2 > 0.01 else 0):  # 0.01^100 does not underflow
+        _step_backward(targets, probabilities, survives, out)
+        survives = np.where(aside, out, 0.0)
+        bound *= lambda_2
+        # The largest of the survivals of k steps is at least the eigenvalue to the power of k.
+        if survives.max() <= bound:
+            return phi
     return None
 
 
@@ -469,7 +482,9 @@ def _iterated_times(
 
     where phi (1 - psi) = 0, so the series forgets as fast as the chain does and is of the size
     of that time, however large the first term. psi comes from the likeliest state just as phi
-    does from x_2. With `escape` 0 all is in the series.
+    does from x_2. With `escape` 0 all is in the series, which then has no negative term. It is
+    also taken where the two parts nearly cancel: states that outlive the metastable ones by far
+    but only for a few steps, which needs a small lambda_2.
     """
     n = len(targets)
     psi = np.zeros(n)
@@ -483,17 +498,24 @@ def _iterated_times(
         found = _iterate(_step_backward, targets, probabilities, likeliest, floor)
         if found is None:
             return None
-        if phi @ found > 0.0:
-            psi = found / (phi @ found)
+        # 0 where nothing settles at all, and tiny where psi is that of states out of x_2's reach.
+        overlap = float(phi @ found)
+        if overlap < _UNDERFLOW:
+            return _iterated_times(targets, probabilities, among, phi, 0.0)
+        psi = found / overlap
     rest = np.where(among, 1.0 - psi, 0.0)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        first = np.where(psi > 0.0, psi / escape, 0.0)
+    first = np.zeros(n)
+    with np.errstate(over="ignore"):
+        np.divide(psi, escape, out=first, where=psi > 0.0)
     series = np.zeros(n)
     out = np.empty(n)
     for k in range(1, _STEPS + 1):
         largest = float(np.max(np.abs(rest) / np.maximum(first + series, 1.0)))
         if k * largest <= TOLERANCE:
-            return first + series
+            times = first + series
+            if (first > _CANCELLATION * times).any():
+                return _iterated_times(targets, probabilities, among, phi, 0.0)
+            return times
         _step_backward(targets, probabilities, rest, out)
         if k <= _PLAIN_STEPS:
             series += rest
@@ -554,7 +576,7 @@ class Metastability:
         Raises
         ------
         ChainError
-            If the chain mixes too slowly to be iterated and is too large to be eliminated.
+            If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
         """
         targets, probabilities = self._targets, self._probabilities
         endless = ~_mark_can_fall(targets)
@@ -594,12 +616,9 @@ def _solve(targets: np.ndarray, outcomes: np.ndarray, probabilities: np.ndarray)
             start = int(np.argmax(safe))
             endless = True
 
-    def floor(out: np.ndarray, total: float) -> float:
-        return TOLERANCE / n * (1.0 if endless else float(out[0]) / (float(out[0]) + total))
-
-    phi = _iterate(_step_forward, targets, probabilities, start, floor)
+    phi = _iterated_distribution(targets, probabilities, start, endless)
     if phi is None:
-        phi = _eliminated_distribution(targets, probabilities, start)
+        phi = _dense_distribution(targets, probabilities, start)
     phi.flags.writeable = False
 
     out = np.empty(n)
@@ -641,7 +660,7 @@ def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
     InputError
         If mu_s or sigma_s is not allowed.
     ChainError
-        If the chain mixes too slowly to be iterated and is too large to be eliminated.
+        If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
     return _solve(mesh.targets, mesh.outcomes, slope_probabilities(mesh.slopes, mu_s, sigma_s))
 
@@ -665,7 +684,7 @@ def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLik
     InputError
         If an argument is not allowed.
     ChainError
-        If the chain mixes too slowly to be iterated and is too large to be eliminated.
+        If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
     shape = np.shape(targets)
     if len(shape) != 2 or shape[0] < 2 or shape[1] < 1:

@@ -1,0 +1,567 @@
+"""The chain: against closed forms, a second method, and arithmetic of a hundred digits and more."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, reject, settings
+from hypothesis import strategies as st
+from scipy.sparse.linalg import eigs
+
+from biped_mfpt_ros.chain import markov
+from biped_mfpt_ros.chain.markov import (
+    ChainError,
+    Metastability,
+    metastability,
+    slope_probabilities,
+    solve_chain,
+    transition_matrix,
+)
+from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh
+from biped_mfpt_ros.errors import InputError
+
+# Required of every MFPT; the solver aims at 1e-12 (markov.TOLERANCE).
+RELATIVE = 1e-10
+
+
+@pytest.fixture(params=["iteration", "dense"])
+def method(request, monkeypatch):
+    """Both ways to solve a chain; the first falls back to the second where it does not settle."""
+    if request.param == "dense":
+        monkeypatch.setattr(markov, "_STEPS", 0)
+    return request.param
+
+
+@pytest.fixture
+def only_iteration(monkeypatch):
+    """Anything but iteration is an error."""
+    monkeypatch.setattr(markov, "DENSE_LIMIT", 0)
+
+
+def solve(rows, probabilities, code=2) -> Metastability:
+    """Chain from the targets of states 1, 2, ...; every fall has the same code."""
+    targets = np.array([[0] * len(probabilities), *rows], dtype=np.uint32)
+    outcomes = np.where(targets == 0, code, 0).astype(np.uint8)
+    outcomes[0] = NOT_SIMULATED
+    return solve_chain(targets, outcomes, probabilities)
+
+
+def exact_chain(rows, probabilities) -> tuple[mpmath.matrix, list]:
+    """I - Q and the falls, exact sums of the given probabilities scaled to sum exactly 1."""
+    exact = [mpmath.mpf(float(p)) for p in probabilities]
+    total = sum(exact)
+    n = len(rows)
+    a = mpmath.zeros(n)
+    falls = [mpmath.mpf(0)] * n
+    for i, row in enumerate(rows):
+        a[i, i] += 1
+        for target, p in zip(row, exact, strict=True):
+            if target == 0:
+                falls[i] += p / total
+            else:
+                a[i, target - 1] -= p / total
+    return a, falls
+
+
+def exact_times(rows, probabilities, digits=120) -> list:
+    with mpmath.workdps(digits):
+        a, _ = exact_chain(rows, probabilities)
+        return list(mpmath.lu_solve(a, mpmath.ones(len(rows), 1)))
+
+
+def exact_failure_probability(rows, probabilities, digits=120):
+    """The smallest eigenvalue of I - Q, of the states that can be reached from the first."""
+    reached, waiting = {1}, [1]
+    while waiting:
+        for target, p in zip(rows[waiting.pop() - 1], probabilities, strict=True):
+            if p > 0.0 and target not in reached | {0}:
+                reached.add(target)
+                waiting.append(target)
+    number = {0: 0} | {old: new for new, old in enumerate(sorted(reached), start=1)}
+    rows = [[number.get(t, 0) for t in rows[i - 1]] for i in sorted(reached)]
+    with mpmath.workdps(digits):
+        a, _ = exact_chain(rows, probabilities)
+        if len(rows) == 1:  # mpmath.eig returns this one in a list too many
+            return a[0, 0]
+        return min(mpmath.re(value) for value in mpmath.eig(a, left=False, right=False))
+
+
+def relative(value, reference) -> float:
+    return float(abs(mpmath.mpf(float(value)) / reference - 1))
+
+
+def birth_death(n, ends=(0, None)) -> list[list[int]]:
+    """Steps down and up among 1..n; below and above are `ends`, None for staying."""
+    low, high = (e if e is not None else stay for e, stay in zip(ends, (1, n), strict=True))
+    return [[i - 1 if i > 1 else low, i + 1 if i < n else high] for i in range(1, n + 1)]
+
+
+def walker(half, contraction) -> tuple[list[list[int]], np.ndarray]:
+    """A chain like a walker's: rows and slopes, which push it, it returns, it falls when far out.
+
+    States are offsets -half..half, the first one (x_2) in the middle.
+    """
+    slopes = np.radians(np.arange(-40, 41) * 0.5)
+    offsets = sorted(range(-half, half + 1), key=abs)
+    number = {offset: i for i, offset in enumerate(offsets, start=1)}
+    rows = [
+        [number.get(round(contraction * o + math.degrees(s)), 0) for s in slopes] for o in offsets
+    ]
+    return rows, slopes
+
+
+# Closed forms -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("p", [0.7, 1e-3, 1e-8, 1e-14, 1e-20, 1e-100])
+def test_one_state_is_geometric(method, p):
+    result = solve([[0, 1]], [p, 1.0 - p])
+    assert result.mfpt == pytest.approx(1.0 / p, rel=1e-14)
+    assert result.failure_probability == pytest.approx(p, rel=1e-14)
+    assert result.lambda_2 == pytest.approx(1.0 - p, rel=1e-14)
+    assert result.mfpt_from_state == pytest.approx([0.0, 1.0 / p], rel=1e-14)
+    assert result.distribution.tolist() == [0.0, 1.0]
+    assert result.failure_shares == {2: 1.0}
+
+
+@pytest.mark.parametrize("e", [0.1, 1e-3, 1e-8, 1e-14, 1e-20])
+def test_two_states(method, e):
+    # From 1: falls e, to 2 with 0.3. From 2: never falls, to 1 with 0.2 + e.
+    # lambda^2 - (a + d) lambda + (a d - b c) = 0, solved for 1 - lambda with 200 digits.
+    p = [e, 0.2, 0.3, 0.5 - e]
+    result = solve([[0, 1, 2, 1], [1, 1, 2, 2]], p)
+    with mpmath.workdps(200):
+        e, r, b, _ = (mpmath.mpf(x) / sum(map(mpmath.mpf, p)) for x in p)
+        half_trace, determinant = (e + b + e + r) / 2, (e + b) * (e + r) - b * (e + r)
+        escape = half_trace - mpmath.sqrt(half_trace**2 - determinant)
+    assert relative(result.failure_probability, escape) < 1e-13
+    assert relative(result.mfpt, 1 / escape) < 1e-13
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0, 10.0, 50.0])
+def test_birth_death_first_passage(method, ratio):
+    # m_k - m_{k-1} = h_k, the time from k to k - 1: h_n = 1/q, h_k = 1/q + (p/q) h_{k+1}.
+    n, q = 12, 1.0 / (1.0 + ratio)
+    p = 1.0 - q
+    result = solve(birth_death(n), [q, p])
+    h = [1.0 / q]
+    while len(h) < n:
+        h.append(1.0 / q + p / q * h[-1])
+    assert result.mfpt_from_state[1:] == pytest.approx(np.cumsum(h[::-1]), rel=RELATIVE)
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 40, 300])
+def test_symmetric_walk_between_two_falls(method, n):
+    # Eigenvalue cos(pi / (n + 1)), eigenvector sin(k pi / (n + 1)), m_k = k (n + 1 - k). It has
+    # period 2, and 300 states mix too slowly to be iterated.
+    result = solve(birth_death(n, ends=(0, 0)), [0.5, 0.5])
+    k = np.arange(1, n + 1)
+    angle = math.pi / (n + 1)
+    assert result.failure_probability == pytest.approx(2.0 * math.sin(angle / 2) ** 2, rel=RELATIVE)
+    assert result.lambda_2 == pytest.approx(math.cos(angle), rel=RELATIVE, abs=1e-15)
+    wave = np.sin(k * angle)
+    if n > 1:  # for n = 1 lambda_2 = 0, from the first step on
+        assert result.distribution[1:] == pytest.approx(wave / wave.sum(), rel=1e-9)
+    assert result.mfpt_from_state[1:] == pytest.approx(k * (n + 1.0 - k), rel=RELATIVE)
+
+
+@pytest.mark.parametrize("n", [2, 3, 7, 250])
+@pytest.mark.parametrize("p", [0.5, 1e-12])
+def test_ring_with_one_place_to_fall(method, n, p):
+    # Survives a round with 1 - p: lambda_2^n = 1 - p. Period n.
+    rows = [[i % n + 1] * 2 for i in range(1, n)] + [[0, 1]]
+    result = solve(rows, [p, 1.0 - p])
+    assert result.failure_probability == pytest.approx(
+        -math.expm1(math.log1p(-p) / n), rel=RELATIVE
+    )
+    rounds = 1.0 / p
+    expected = [n * (rounds - 1.0) + n - i for i in range(n)]
+    assert result.mfpt_from_state[1:] == pytest.approx(expected, rel=RELATIVE)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 150])
+def test_certain_fall_has_lambda_2_zero(method, n):
+    result = solve([[i + 1, i + 1] for i in range(1, n)] + [[0, 0]], [0.5, 0.5])
+    # Exact if the chain ends while it is iterated plainly, within the tolerance after that.
+    assert result.lambda_2 == pytest.approx(0.0, abs=markov.TOLERANCE if n > 100 else 0.0)
+    assert result.failure_probability == pytest.approx(1.0, rel=markov.TOLERANCE)
+    assert result.mfpt == pytest.approx(1.0, rel=markov.TOLERANCE)
+    assert result.distribution[-1] == pytest.approx(1.0, rel=markov.TOLERANCE)
+    assert result.mfpt_from_state[1:] == pytest.approx(np.arange(n, 0, -1), rel=RELATIVE)
+
+
+def test_small_lambda_2_is_accurate(method):
+    # Only the middle one of three slopes is survived.
+    result = solve([[0, 1, 0]], [0.5, 1e-30, 0.5])
+    assert result.lambda_2 == pytest.approx(1e-30, rel=1e-13)
+    assert result.mfpt == 1.0
+
+
+def test_equal_classes_one_behind_the_other(method):
+    # Both states keep 0.3 of their weight, and 1 leads to 2: one eigenvalue, one eigenvector.
+    result = solve([[1, 2, 0], [2, 0, 0]], [0.3, 0.2, 0.5])
+    assert result.lambda_2 == pytest.approx(0.3, rel=1e-14)
+    assert result.distribution == pytest.approx([0.0, 0.0, 1.0], abs=1e-14)
+
+
+def test_state_that_outlives_the_metastable_ones(method):
+    # One of three slopes leads from 1 to 2, and from there only 1e-9 survives: psi_1 is 3e8.
+    p = [0.4, 0.6 - 1e-9, 1e-9]
+    result = solve([[2, 0, 0], [0, 0, 2]], p)
+    assert result.mfpt == pytest.approx(1.0 + 1e-9, rel=1e-13)
+    assert result.mfpt_from_state[1] == pytest.approx(1.0 + 0.4 * (1.0 + 1e-9), rel=1e-13)
+
+
+# Falls that cannot happen, states that cannot be reached -----------------------------------------
+
+
+def test_no_fall_can_be_reached(method):
+    result = solve([[1, 2], [2, 1]], [0.25, 0.75])
+    assert result.mfpt == math.inf
+    assert (result.lambda_2, result.failure_probability) == (1.0, 0.0)
+    assert result.failure_shares == {}
+    assert result.distribution == pytest.approx([0.0, 0.5, 0.5], rel=1e-11)
+    assert result.mfpt_from_state.tolist() == [0.0, math.inf, math.inf]
+
+
+def test_part_of_the_chain_never_falls(method):
+    # 1 falls or comes to 2, 3; 4 falls in one step, 5 with 0.5 in each.
+    result = solve([[0, 2], [3, 2], [2, 3], [0, 0], [0, 5]], [0.5, 0.5])
+    assert result.mfpt == math.inf
+    assert result.distribution == pytest.approx([0, 0, 0.5, 0.5, 0, 0], rel=1e-11)
+    assert result.mfpt_from_state == pytest.approx([0, math.inf, math.inf, math.inf, 1, 2])
+
+
+def test_a_slope_without_probability_does_not_happen(method):
+    assert solve([[1, 0], [1, 0]], [1.0, 0.0]).mfpt == math.inf
+
+
+def test_states_out_of_reach_do_not_matter(method):
+    # 2 never falls and 3 hardly ever; x_2 is 1 and leads to neither.
+    result = solve([[0, 1], [2, 2], [1, 3]], [0.25, 0.75])
+    assert result.mfpt == pytest.approx(4.0, rel=1e-13)
+    assert result.distribution == pytest.approx([0, 1, 0, 0])
+    assert result.mfpt_from_state == pytest.approx([0, 4, math.inf, 8])
+
+
+# High precision ---------------------------------------------------------------------------------
+
+
+def check_exactly(result, rows, probabilities) -> None:
+    escape = exact_failure_probability(rows, probabilities)
+    assert relative(result.failure_probability, escape) < RELATIVE
+    assert relative(result.mfpt, 1 / escape) < RELATIVE
+    references = exact_times(rows, probabilities)
+    for value, reference in zip(result.mfpt_from_state[1:], references, strict=True):
+        assert relative(value, reference) < RELATIVE
+
+
+@pytest.mark.parametrize(
+    ("half", "mfpt", "sigma_deg"),
+    [
+        *[(4, 1e3, 1.25), (4, 1e8, 0.715), (4, 1e14, 0.526), (4, 1e20, 0.432)],
+        *[(5, 1e3, 1.38), (5, 1e8, 0.782), (5, 1e14, 0.581), (5, 1e20, 0.474)],
+    ],
+)
+def test_walker_chain_in_high_precision(method, half, mfpt, sigma_deg):
+    rows, slopes = walker(half, 0.5)
+    p = slope_probabilities(slopes, 0.0, math.radians(sigma_deg))
+    result = solve(rows, p)
+    assert 0.3 < result.mfpt / mfpt < 3.0  # the case is what it says
+    check_exactly(result, rows, p)
+
+
+@pytest.mark.parametrize(("n", "mfpt"), [(4, 1e3), (9, 1e8), (16, 1e14), (23, 1e20)])
+def test_falls_from_rare_states_in_high_precision(method, n, mfpt):
+    # Drifts away from the only state that falls: all falls come from a weight of 1 / MFPT.
+    result = solve(birth_death(n), [0.125, 0.875])
+    assert 0.1 < result.mfpt / mfpt < 10.0
+    check_exactly(result, birth_death(n), [0.125, 0.875])
+
+
+@pytest.mark.parametrize("coupling", [1e-2, 1e-6, 1e-10, 1e-15, 1e-22])
+@pytest.mark.parametrize("falls", [(1e-3, 1e-5), (1e-8, 1e-3), (1e-14, 1e-20), (1e-20, 1e-19)])
+def test_two_gaits_with_rare_changes_in_high_precision(method, coupling, falls):
+    # Slopes: even; one on which gait 1 falls; one on which gait 2 falls; one that changes it.
+    a, b = falls
+    p = [1.0 - a - b - coupling, a, b, coupling]
+    rows = [[2, 0, 2, 3], [1, 0, 1, 1], [4, 4, 0, 2], [3, 3, 0, 4]]
+    check_exactly(solve(rows, p), rows, p)
+
+
+def test_slow_gait_change_is_not_taken_for_settled(monkeypatch, only_iteration):
+    # Gait 1 is given up for gait 2 once in 1e15 steps: no step changes much.
+    monkeypatch.setattr(markov, "_STEPS", 500)
+    rows = [[1, 0, 1, 2], [2, 2, 0, 2]]
+    with pytest.raises(ChainError):
+        solve(rows, [1.0 - 3e-9, 1e-9, 1e-12, 2e-9])
+
+
+@st.composite
+def chains(draw):
+    """Rows and probabilities of a small chain, some probabilities down to 1e-25."""
+    n, m = draw(st.integers(1, 5)), draw(st.integers(1, 5))
+    state = st.integers(0, n)
+    rows = draw(st.lists(st.lists(state, min_size=m, max_size=m), min_size=n, max_size=n))
+    logs = draw(st.lists(st.floats(-25.0, 0.0), min_size=m, max_size=m))
+    p = 10.0 ** np.array(logs)
+    return rows, p / p.sum()
+
+
+@given(chains())
+@settings(deadline=None, max_examples=200)
+def test_random_chain_in_high_precision(chain):
+    rows, p = chain
+    result = solve(rows, p)
+    # A multiple eigenvalue is found with a fifth of the digits. None is between 0 and 1e-130.
+    try:
+        escape = exact_failure_probability(rows, p, digits=1000)
+    except RuntimeError:  # mpmath's QR iteration gives up now and then
+        reject()
+    if escape < mpmath.mpf(10) ** -150:
+        assert result.mfpt == math.inf
+    else:
+        assert relative(result.failure_probability, escape) < RELATIVE
+        assert relative(result.mfpt, 1 / escape) < RELATIVE
+    times = result.mfpt_from_state[1:]
+    if np.isfinite(times).all():
+        for value, reference in zip(times, exact_times(rows, p), strict=True):
+            assert relative(value, reference) < RELATIVE
+
+
+# A second method --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma_deg", [1.4, 2.0, 4.0])
+def test_sparse_eigenvalue_solver_agrees(sigma_deg):
+    # Where 1 - lambda_2 is not small, an ordinary solver is accurate too.
+    rows, slopes = walker(5, 0.5)
+    p = slope_probabilities(slopes, 0.0, math.radians(sigma_deg))
+    result = solve(rows, p)
+    t = transition_matrix([[0] * len(p), *rows], p)
+    q = t[1:, 1:]
+    value, vector = eigs(q.T, k=1, which="LR")
+    vector = np.abs(vector.ravel())
+    assert result.lambda_2 == pytest.approx(value.real[0], rel=1e-12)
+    assert result.distribution[1:] == pytest.approx(vector / vector.sum(), abs=1e-12)
+    times = np.linalg.solve(np.eye(len(rows)) - q.toarray(), np.ones(len(rows)))
+    assert result.mfpt_from_state[1:] == pytest.approx(times, rel=1e-10)
+
+
+def test_both_methods_agree_on_a_larger_chain(monkeypatch):
+    rows, slopes = walker(60, 0.9)
+    p = slope_probabilities(slopes, math.radians(1.0), math.radians(2.0))
+    iterated = solve(rows, p)
+    times = iterated.mfpt_from_state
+    monkeypatch.setattr(markov, "_STEPS", 0)
+    dense = solve(rows, p)
+    assert iterated.mfpt == pytest.approx(dense.mfpt, rel=1e-11)
+    assert times == pytest.approx(dense.mfpt_from_state, rel=1e-11)
+    matters = dense.distribution > 1e-11 * dense.failure_probability
+    assert iterated.distribution[matters] == pytest.approx(dense.distribution[matters], rel=1e-11)
+
+
+def test_usual_chains_are_iterated(only_iteration):
+    rows, slopes = walker(60, 0.9)
+    result = solve(rows, slope_probabilities(slopes, 0.0, math.radians(1.0)))
+    assert result.mfpt_from_state[1] == pytest.approx(result.mfpt, rel=1e-3)
+
+
+# Properties -------------------------------------------------------------------------------------
+
+
+@given(chains())
+@settings(deadline=None)
+def test_transition_matrix_is_stochastic(chain):
+    rows, p = chain
+    targets = np.array([[0] * len(p), *rows])
+    t = transition_matrix(targets, p)
+    # Each row is the same m probabilities, summed in some order.
+    assert t.sum(axis=1) == pytest.approx(np.ones(len(targets)), abs=len(p) * 2.3e-16)
+    for i, j in np.ndindex(t.shape):
+        expected = float(i == j) if i == 0 else p[targets[i] == j].sum()
+        assert t[i, j] == pytest.approx(expected, rel=1e-15)
+
+
+@given(chains(), st.randoms(use_true_random=False))
+@settings(deadline=None)
+def test_results_are_probabilities_and_do_not_depend_on_names(chain, random):
+    rows, p = chain
+    n = len(rows)
+    result = solve(rows, p)
+    assert result.distribution.sum() == pytest.approx(1.0, abs=1e-14)
+    assert result.distribution[0] == 0.0
+    assert (result.distribution >= 0.0).all()
+    assert result.lambda_2 + result.failure_probability == pytest.approx(1.0, abs=1e-15)
+    assert sum(result.failure_shares.values()) == pytest.approx(float(result.mfpt < math.inf))
+
+    others = list(range(2, n + 1))
+    random.shuffle(others)
+    name = [0, 1, *others]
+    renamed = [[]] * n
+    for i, row in enumerate(rows, start=1):
+        renamed[name[i] - 1] = [name[target] for target in row]
+    other = solve(renamed, p)
+    assert other.mfpt == pytest.approx(result.mfpt, rel=1e-11)
+    assert other.mfpt_from_state[name] == pytest.approx(result.mfpt_from_state, rel=1e-11)
+
+
+@given(chains())
+@settings(deadline=None)
+def test_metastable_distribution_is_an_eigenvector(chain):
+    rows, p = chain
+    result = solve(rows, p)
+    q = transition_matrix([[0] * len(p), *rows], p)[1:, 1:].toarray()
+    phi = result.distribution[1:]
+    assert phi @ q == pytest.approx(result.lambda_2 * phi, abs=1e-11)
+
+
+@given(chains(), st.data())
+@settings(deadline=None)
+def test_surviving_one_more_fall_never_lowers_the_mfpt(chain, data):
+    # Q grows in one entry, and so does its largest eigenvalue, or it stays.
+    rows, p = chain
+    falls = [(i, s) for i, row in enumerate(rows) for s, target in enumerate(row) if target == 0]
+    if not falls:
+        return
+    i, s = data.draw(st.sampled_from(falls))
+    better = [list(row) for row in rows]
+    better[i][s] = data.draw(st.integers(1, len(rows)))
+    assert solve(better, p).mfpt >= solve(rows, p).mfpt * (1.0 - 1e-11)
+
+
+def test_failure_shares_are_weighted_by_state_and_slope(method):
+    # Stationary 2:1 between the states but for falls; they fall with codes 1, 7 and 9.
+    targets = [[0] * 4, [0, 1, 2, 0], [0, 1, 1, 2]]
+    outcomes = [[NOT_SIMULATED] * 4, [7, 0, 0, 1], [9, 0, 0, 0]]
+    p = np.array([1e-14, 0.5, 0.5 - 3e-14, 2e-14])
+    result = solve_chain(targets, outcomes, p)
+    phi = result.distribution
+    total = phi[1] * (p[0] + p[3]) + phi[2] * p[0]
+    assert result.failure_probability == pytest.approx(total, rel=1e-13)
+    assert list(result.failure_shares) == [1, 7, 9]
+    assert result.failure_shares[1] == pytest.approx(phi[1] * p[3] / total, rel=1e-13)
+    assert result.failure_shares[7] == pytest.approx(phi[1] * p[0] / total, rel=1e-13)
+    assert result.failure_shares[9] == pytest.approx(phi[2] * p[0] / total, rel=1e-13)
+
+
+# Slopes -----------------------------------------------------------------------------------------
+
+
+def test_slope_probabilities_are_the_normal_density():
+    slopes = np.radians(np.arange(-40, 41) * 0.5)
+    mu, sigma = math.radians(0.3), math.radians(1.0)
+    p = slope_probabilities(slopes, mu, sigma)
+    with mpmath.workdps(50):
+        density = [
+            mpmath.npdf(mpmath.mpf(float(s)), mpmath.mpf(mu), mpmath.mpf(sigma)) for s in slopes
+        ]
+        total = sum(density)
+        for value, reference in zip(p, density, strict=True):
+            # Down to 1e-92: the exponent is right to some 1e-16 of itself.
+            assert relative(value, reference / total) < 1e-13
+
+
+@pytest.mark.parametrize(("ratio", "error"), [(0.5, 1e-14), (1.0, 3e-7), (2.0, 0.3)])
+def test_slope_probabilities_have_the_moments_of_the_distribution(ratio, error):
+    # What the docstring says of the trapezoidal rule: d_s = ratio sigma_s. The second moment's
+    # error is about 4 pi^2 / ratio^2 times that of the sum, 2 exp(-2 pi^2 / ratio^2).
+    slopes = np.arange(-200, 201) * 0.001
+    mu, sigma = 0.0123, 0.001 / ratio
+    p = slope_probabilities(slopes, mu, sigma)
+    assert p.sum() == pytest.approx(1.0, abs=1e-15)
+    assert p @ slopes == pytest.approx(mu, abs=error * sigma)
+    assert p @ (slopes - mu) ** 2 == pytest.approx(sigma**2, rel=error)
+
+
+def test_narrow_density_falls_on_the_nearest_slope():
+    assert slope_probabilities([-0.1, 0.0, 0.1], 0.04, 1e-9).tolist() == [0.0, 1.0, 0.0]
+    assert slope_probabilities([-0.1, 0.1], 0.0, 1e-200).tolist() == [0.5, 0.5]
+
+
+# Bad input --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0, math.nan, math.inf, "1"])
+def test_sigma_must_be_positive(sigma):
+    with pytest.raises(InputError, match=r"^sigma_s"):
+        slope_probabilities([0.0, 0.1], 0.0, sigma)
+
+
+@pytest.mark.parametrize("mu", [-0.01, 0.11, math.nan, math.inf, None])
+def test_mu_must_be_within_the_slopes(mu):
+    with pytest.raises(InputError, match=r"^mu_s"):
+        slope_probabilities([0.0, 0.1], mu, 0.1)
+
+
+@pytest.mark.parametrize("slopes", [[], [0.1, 0.0], [0.0, 0.0], [0.0, math.nan], [[0.0]]])
+def test_slopes_must_ascend(slopes):
+    with pytest.raises(InputError, match=r"^slopes"):
+        slope_probabilities(slopes, 0.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("field", "change"),
+    [
+        ("targets", {"targets": [0, 0]}),
+        ("targets", {"targets": [[0, 0]]}),
+        ("targets", {"targets": [[0, 0], [2, 0]]}),
+        ("targets", {"targets": [[0, 0], [-1, 0]]}),
+        ("targets", {"targets": [[0, 0], [math.nan, 0]]}),
+        ("targets", {"targets": [[0, 0], [0, 0]]}),
+        ("targets", {"targets": [[1, 0], [1, 0]]}),
+        ("outcomes", {"outcomes": [[255, 255]]}),
+        ("outcomes", {"outcomes": [[255, 255], [0, 256]]}),
+        ("targets", {"outcomes": [[255, 255], [0, 0]]}),
+        ("targets", {"outcomes": [[0, 0], [0, 1]]}),
+        ("probabilities", {"probabilities": [1.0]}),
+        ("probabilities", {"probabilities": [0.5, 0.4]}),
+        ("probabilities", {"probabilities": [1.5, -0.5]}),
+        ("probabilities", {"probabilities": [math.nan, 1.0]}),
+    ],
+)
+def test_chain_arrays_are_checked(field, change):
+    good = {
+        "targets": [[0, 0], [1, 0]],
+        "outcomes": [[255, 255], [0, 1]],
+        "probabilities": [0.5, 0.5],
+    }
+    assert solve_chain(**good).mfpt == 2.0
+    with pytest.raises(InputError, match=f"^{field}"):
+        solve_chain(**{**good, **change})
+
+
+def test_too_large_and_too_slow_is_a_clear_error(monkeypatch):
+    monkeypatch.setattr(markov, "DENSE_LIMIT", 299)
+    with pytest.raises(ChainError, match="300 states"):
+        solve(birth_death(300, ends=(0, 0)), [0.5, 0.5])
+
+
+def test_one_mesh_serves_any_distribution():
+    rows, slopes = walker(4, 0.5)
+    targets = np.array([[0] * len(slopes), *rows])
+    outcomes = np.where(targets == 0, 6, 0)
+    outcomes[0] = NOT_SIMULATED
+    n = len(targets)
+    mesh = Mesh(
+        slopes=slopes,
+        states=np.zeros((n, 10)),
+        preceding=np.zeros(n),
+        generation=np.zeros(n),
+        targets=targets,
+        outcomes=outcomes,
+        scales=np.ones(10),
+        threshold=0.1,
+        clustered=True,
+    )
+    before = math.inf
+    for sigma_deg in (0.5, 1.0, 2.0, 4.0):
+        p = slope_probabilities(slopes, 0.0, math.radians(sigma_deg))
+        result = metastability(mesh, 0.0, math.radians(sigma_deg))
+        assert result.mfpt == solve(rows, p).mfpt
+        assert result.failure_shares == {6: 1.0}
+        assert result.mfpt < before  # rougher ground
+        before = result.mfpt
