@@ -178,6 +178,8 @@ class TestBadInput:
             (["mfpt", "--sigma"], "--sigma", None),
             (["mfpt", "--sigma", "1", "0"], "--sigma", "0.0"),
             (["mfpt", "--sigma", "1", "--mean", "nan"], "--mean", "nan"),
+            (["mfpt", "--sigma", "1", "--mean", "-21"], "--mean", "-21"),
+            (["mfpt", "--sigma", "1", "--mean", "6", "--slope-limit", "5"], "--mean", "6"),
             (["run", "--workers", "0"], "--workers", "0"),
             (["run", "--walks", "-1"], "--walks", "-1"),
             (["run", "--seed", "-1"], "--seed", "-1"),

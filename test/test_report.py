@@ -270,4 +270,4 @@ class TestPictures:
             path, "title", walk, "walk", sigma, mfpt, [(1.0, 113.1, "mesh")], [(2.0, 6.0, 5.9, 6.1)]
         )
         assert path.read_bytes().startswith(b"\x89PNG")
-        pictures.save_run(path, "title", walk, "walk", sigma, mfpt)
+        pictures.save_run(path, "title", walk, "walk", sigma, np.full(5, math.inf))

@@ -42,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def stop(number: int, frame: object) -> None:
         nonlocal stopped
+        if stopped:  # threads that compute are waited for, unless one insists
+            os._exit(EXIT_STOPPED)
         stopped = True
         raise KeyboardInterrupt
 
@@ -90,6 +92,8 @@ def _run(args: argparse.Namespace) -> int:
 # Fields of the core that are not called as the options that set them.
 _OPTIONS = {
     "bag": "BAG",
+    "mu_s": "--mean",
+    "sigma_s": "--sigma",
     "mu_s_deg": "--mean",
     "sigma_s_deg": "--sigma",
     "states": "--state",

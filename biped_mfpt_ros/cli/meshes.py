@@ -51,7 +51,7 @@ def mfpt(args: argparse.Namespace) -> None:
     """Mesh a controller and compute its MFPT."""
     from biped_mfpt_ros.chain.markov import metastability
 
-    mean = options.slope("--mean", args.mean)
+    mean = options.mean_of(args)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
     grown, result = _grow(args)
     start = time.perf_counter()

@@ -48,6 +48,14 @@ def slope(option: str, degrees: float) -> float:
     return math.radians(degrees)
 
 
+def mean_of(args: argparse.Namespace) -> float:
+    """The mean slope of a command that meshes, rad; it has to be within the slope set."""
+    if abs(args.mean) > args.slope_limit:
+        allowed = f"within --slope-limit, -{args.slope_limit:g} to {args.slope_limit:g} degrees"
+        raise InputError("--mean", args.mean, allowed)
+    return slope("--mean", args.mean)
+
+
 def spread(option: str, degrees: float) -> float:
     """A standard deviation of the slope in rad; raises InputError in the degrees typed."""
     if not 0.0 < degrees < math.inf:

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> None:
     # All that may be wrong is found before anything is started or written.
     controller, model = options.controller_of(args), options.model_of(args)
     slopes = options.slopes_of(args)
-    mean = options.slope("--mean", args.mean)
+    mean = options.mean_of(args)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
     workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
     for option, value, least in (

@@ -216,6 +216,9 @@ def draw_mfpt(
     """
     finite = np.isfinite(mfpt)
     axes.plot(sigma_deg[finite], mfpt[finite], color=_OURS, linewidth=2.0, label="our mesh")
+    if not finite.any():
+        middle = {"ha": "center", "va": "center", "transform": axes.transAxes}
+        axes.text(0.5, 0.5, "no fall can be reached", **middle)
     if monte_carlo:
         at, steps, low, high = np.array(monte_carlo).T
         axes.errorbar(
