@@ -154,9 +154,9 @@ def _parents() -> dict[str, Parser]:
     mesh.add_argument(
         "--slope-step",
         type=_number,
-        default=0.5,
+        default=0.25,
         metavar="DEG",
-        help="degrees between the slopes of the set, d_s of the paper (default: 0.5)",
+        help="degrees between the slopes of the set, d_s of the paper (default: 0.25)",
     )
     mesh.add_argument(
         "--slope-limit",
@@ -168,10 +168,10 @@ def _parents() -> dict[str, Parser]:
     mesh.add_argument(
         "--threshold",
         type=_number,
-        default=0.3,
+        default=0.03,
         metavar="D",
         help="standardized squared distance from which on a state is a new one, d_thr of the "
-        "paper (default: 0.3)",
+        "paper (default: 0.03)",
     )
     mesh.add_argument(
         "--unclustered",
