@@ -15,15 +15,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from biped_mfpt_ros.control.controller import Controller
-from biped_mfpt_ros.gait.trace import trace_swing
+from biped_mfpt_ros.gait.trace import Trace, trace_swing
+from biped_mfpt_ros.report.style import BODY, GRID, GROUND, OURS, PAPER, STANCE, SWING
 from biped_mfpt_ros.walker.dynamics import to_absolute
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import Robot, WalkerModel
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
 
-_OURS, _PAPER, _STANCE, _SWING, _BODY, _GROUND = (
-    "#1f5fa8", "#d1495b", "#1f5fa8", "#e08e1b", "#333a45", "#8a7f72",
-)  # fmt: skip
 _INTERVAL = 0.085  # s between the figures of a sequence
 
 
@@ -43,6 +41,8 @@ class Walk:
         rad, shape (steps + 1,): behind the first stance foot, then ahead of each.
     outcome : Outcome
         How the last step ended.
+    forces : numpy.ndarray
+        N, shape (k, 2): of the ground on the stance foot, horizontal and vertical.
     """
 
     points: np.ndarray
@@ -50,6 +50,7 @@ class Walk:
     feet: np.ndarray
     slopes: np.ndarray
     outcome: Outcome
+    forces: np.ndarray
 
 
 def link_points(states: np.ndarray, robot: Robot) -> np.ndarray:
@@ -100,36 +101,68 @@ def walk(
     interval : float, optional
         s between figures.
     """
-    foot, previous, late = np.zeros(2), 0.0, 0.0
-    points, steps, feet, passed = [], [], [foot], [previous]
-    outcome = Outcome.STEP
-    for number, slope in enumerate(slopes):
-        swing = trace_swing(controller, state, previous, slope, model)
+    starts, swings, passed = [np.asarray(state)], [], [0.0]
+    for slope in slopes:
+        swings.append(trace_swing(controller, starts[-1], passed[-1], slope, model))
         passed.append(slope)
-        # A fall at the very start leaves no samples.
-        at = swing.times if swing.times.size else np.zeros(1)
-        states = swing.states if swing.times.size else np.asarray(state)[None]
-        end = at[-1]
-        times = np.arange(late, end, interval)
+        following = swings[-1].next_state
+        if following is None:
+            break
+        starts.append(following)
+    return figures(swings, starts[: len(swings)], passed, model.robot, interval)
+
+
+def figures(
+    swings: Sequence[Trace],
+    starts: Sequence[np.ndarray],
+    slopes: Sequence[float],
+    robot: Robot,
+    interval: float = _INTERVAL,
+) -> Walk:
+    """Keep figures at regular times of consecutive swings, and the last one.
+
+    Parameters
+    ----------
+    swings : sequence of Trace
+        The swings, each from where the one before it ended.
+    starts : sequence of numpy.ndarray
+        State in which each swing starts, shape (10,): a fall at the very start leaves no samples.
+    slopes : sequence of float
+        rad, behind the first stance foot, then ahead of each.
+    robot : Robot
+        The links.
+    interval : float, optional
+        s between figures.
+    """
+    foot, late = np.zeros(2), 0.0
+    points, forces, steps, feet = [], [], [], [foot]
+    for number, (swing, start, slope) in enumerate(zip(swings, starts, slopes[1:], strict=True)):
+        sampled = swing.times.size > 0
+        at = swing.times if sampled else np.zeros(1)
+        values = np.hstack([swing.states, swing.forces]) if sampled else np.zeros((1, 12))
+        if not sampled:
+            values[0, :10] = start
+        times = np.arange(late, at[-1], interval)
+        late = (times[-1] + interval if times.size else late) - at[-1]
+        if swing.next_state is None or number == len(swings) - 1:
+            times = np.append(times, at[-1])
         if times.size:
-            sampled = np.stack([np.interp(times, at, column) for column in states.T], axis=1)
-            points.append(link_points(sampled, model.robot) + foot)
+            kept = np.stack([np.interp(times, at, column) for column in values.T], axis=1)
+            points.append(link_points(kept[:, :10], robot) + foot)
+            forces.append(kept[:, 10:])
             steps.append(np.full(times.size, number))
-            late = times[-1] + interval - end
-        else:
-            late -= end
-        outcome = swing.outcome
-        last = link_points(states[-1:], model.robot)[0] + foot
-        if swing.next_state is None or number == len(slopes) - 1:
-            points.append(last[None])
-            steps.append(np.full(1, number))
         if swing.next_state is None:
             feet.append(foot + math.cos(slope) * np.array([0.45, 0.45 * math.tan(slope)]))
             break
-        foot, state, previous = last[5], swing.next_state, slope
+        foot = link_points(values[-1:, :10], robot)[0, 5] + foot
         feet.append(foot)
     return Walk(
-        np.concatenate(points), np.concatenate(steps), np.array(feet), np.array(passed), outcome
+        points=np.concatenate(points),
+        steps=np.concatenate(steps),
+        feet=np.array(feet),
+        slopes=np.array(slopes),
+        outcome=swings[-1].outcome,
+        forces=np.concatenate(forces),
     )
 
 
@@ -159,37 +192,54 @@ def example_walk(
     return best
 
 
+def where_it_falls(walking: Walk) -> np.ndarray:
+    """Point of the last figure at which a walk failed: a foot, or a part of the body; m, (2,)."""
+    points = walking.points[-1]
+    if walking.outcome in (Outcome.STANCE_LIFTS, Outcome.STANCE_SLIPS, Outcome.NO_LIFT_OFF):
+        return points[0]
+    if walking.outcome is Outcome.BODY_TOUCHES:
+        corners = ground_line(walking)
+        return min(points[1:5], key=lambda p: p[1] - np.interp(p[0], *corners.T))
+    return points[5]
+
+
+def ground_line(walking: Walk, before: float = 0.5, after: float = 0.25) -> np.ndarray:
+    """Corners of the ground, m, shape (steps + 3, 2); some of it before and after the steps."""
+    behind, ahead = walking.slopes[0], walking.slopes[-1]
+    back = walking.feet[0] - before * np.array([math.cos(behind), math.sin(behind)])
+    front = walking.feet[-1] + after * np.array([math.cos(ahead), math.sin(ahead)])
+    return np.vstack([back, walking.feet, front])
+
+
+def draw_ground(axes: Axes, ground: np.ndarray, top: float) -> None:
+    """Draw ground by its corners, and set the limits of the axes: up to ``top``, m, or more."""
+    low = ground[:, 1].min() - 0.12
+    axes.fill_between(ground[:, 0], ground[:, 1], low, color=GROUND, alpha=0.25, linewidth=0)
+    axes.plot(ground[:, 0], ground[:, 1], color=GROUND, linewidth=1.4)
+    axes.set_aspect("equal")
+    axes.set_xlim(ground[0, 0], ground[-1, 0])
+    axes.set_ylim(low, max(ground[:, 1].max(), top) + 0.12)
+
+
 def draw_walk(axes: Axes, walking: Walk) -> None:
     """Draw a walk as a sequence of stick figures on its ground."""
-    feet = walking.feet
-    back = feet[0] - 0.5 * np.array([math.cos(walking.slopes[0]), math.sin(walking.slopes[0])])
-    ahead = walking.slopes[-1]
-    front = feet[-1] + 0.25 * np.array([math.cos(ahead), math.sin(ahead)])
-    ground = np.vstack([back, feet, front])
-    low = ground[:, 1].min() - 0.12
-    axes.fill_between(ground[:, 0], ground[:, 1], low, color=_GROUND, alpha=0.25, linewidth=0)
-    axes.plot(ground[:, 0], ground[:, 1], color=_GROUND, linewidth=1.4)
+    draw_ground(axes, ground_line(walking), walking.points[:, 3, 1].max())
     last = len(walking.points) - 1
     for i, (points, step) in enumerate(zip(walking.points, walking.steps, strict=True)):
         # A leg keeps its colour: it is the stance leg in every second step.
-        legs = (_STANCE, _SWING) if step % 2 == 0 else (_SWING, _STANCE)
+        legs = (STANCE, SWING) if step % 2 == 0 else (SWING, STANCE)
         strong = i in (0, last)
         alpha, width = (0.95, 2.2) if strong else (0.45, 1.1)
         style: dict[str, Any] = {"alpha": alpha, "linewidth": width, "solid_capstyle": "round"}
         axes.plot(*points[[0, 1, 2]].T, color=legs[0], solid_joinstyle="round", **style)
         axes.plot(*points[[5, 4, 2]].T, color=legs[1], solid_joinstyle="round", **style)
-        axes.plot(*points[[2, 3]].T, color=_BODY, **style)
-        axes.plot(*points[3], "o", color=_BODY, alpha=alpha, markersize=3.4 if strong else 2.0)
+        axes.plot(*points[[2, 3]].T, color=BODY, **style)
+        axes.plot(*points[3], "o", color=BODY, alpha=alpha, markersize=3.4 if strong else 2.0)
     if walking.outcome is not Outcome.STEP:
-        foot = walking.points[-1, 5]
-        axes.plot(*foot, "o", color=_PAPER, markersize=9, fillstyle="none", markeredgewidth=1.8)
-        axes.annotate(
-            walking.outcome.label, foot, (8, 10), textcoords="offset points", color=_PAPER
-        )
-    axes.set_aspect("equal")
-    axes.set_xlim(ground[0, 0], ground[-1, 0])
-    axes.set_ylim(low, max(ground[:, 1].max(), walking.points[:, 3, 1].max()) + 0.12)
-    axes.set_xlabel("m")
+        at = where_it_falls(walking)
+        axes.plot(*at, "o", color=PAPER, markersize=9, fillstyle="none", markeredgewidth=1.8)
+        axes.annotate(walking.outcome.label, at, (8, 10), textcoords="offset points", color=PAPER)
+    axes.set_xlabel("distance, m")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(left=False, labelleft=False)
 
@@ -215,21 +265,21 @@ def draw_mfpt(
         Degrees, steps, and their confidence interval.
     """
     finite = np.isfinite(mfpt)
-    axes.plot(sigma_deg[finite], mfpt[finite], color=_OURS, linewidth=2.0, label="our mesh")
+    axes.plot(sigma_deg[finite], mfpt[finite], color=OURS, linewidth=2.0, label="our mesh")
     if not finite.any():
         middle = {"ha": "center", "va": "center", "transform": axes.transAxes}
         axes.text(0.5, 0.5, "no fall can be reached", **middle)
     if monte_carlo:
         at, steps, low, high = np.array(monte_carlo).T
         axes.errorbar(
-            at, steps, [steps - low, high - steps], fmt="s", color=_BODY, markersize=4.5, capsize=3,
+            at, steps, [steps - low, high - steps], fmt="s", color=BODY, markersize=4.5, capsize=3,
             label="our Monte Carlo, 95 %",
         )  # fmt: skip
     for kind, marker in (("mesh", "o"), ("Monte Carlo", "D")):
         at_steps = [(at, steps) for at, steps, which in paper if which == kind]
         if at_steps:
             axes.plot(
-                *np.array(at_steps).T, marker, color=_PAPER, markersize=7, fillstyle="none",
+                *np.array(at_steps).T, marker, color=PAPER, markersize=7, fillstyle="none",
                 markeredgewidth=1.8, label=f"paper, {kind}",
             )  # fmt: skip
     axes.set_yscale("log")
@@ -240,7 +290,7 @@ def draw_mfpt(
     axes.set_xlim(left=0.0)
     axes.set_xlabel("standard deviation of the slope, degrees")
     axes.set_ylabel("mean steps to a fall")
-    axes.grid(which="major", color="#d9dde3", linewidth=0.8)
+    axes.grid(which="major", color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
