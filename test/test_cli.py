@@ -225,6 +225,28 @@ class TestBadInput:
         assert main(["controllers"]) == 130
 
 
+def test_second_interrupt_does_not_wait_for_threads():
+    # Blocks of walks take minutes here, and threads cannot be interrupted.
+    arguments = ["monte-carlo", "--controller", "smc/mfpt", "--sigma", "0.1", "--walks", "640"]
+    with subprocess.Popen([*COMMAND, *arguments], stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60.0
+        # Imports take some two seconds of that, the rest is walking.
+        while _cpu_seconds(process.pid) < 5.0:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+        start = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10.0) == 130
+        assert time.monotonic() - start < 2.0
+
+
+def _cpu_seconds(pid):
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 class TestHelp:
     def test_defaults_in_the_text_are_those_of_the_core(self):
         parser = make_parser().parse_args(["cycle"]).parser
@@ -544,7 +566,10 @@ def wait_until(condition, run, what, timeout=60.0):
 
 
 # A mesh that takes long enough to be interrupted.
-LONG = ("--slope-step", "0.25", "--threshold", "1e-6", "--max-states", "1000000", "--output", "run")
+LONG = (
+    "--slope-step", "0.25", "--threshold", "1e-6", "--max-states", "1000000",
+    "--workers", "1", "--output", "run",
+)  # fmt: skip
 
 
 class TestRun:
