@@ -408,6 +408,56 @@ examples:
         help="degrees, ground ahead, negative is downhill (default: 0)",
     )
 
+    calibrate = add(
+        "calibrate",
+        "calibrate:run",
+        "fit torque limit, friction and slip time to the numbers of the paper",
+        """
+The paper states neither a torque limit nor a friction, nor whether a slip of a millisecond is a
+fall. Every combination of the given values is judged by Monte Carlo against Tables 2 and 4, on the
+same slopes, and by whether the controllers walk on flat ground.
+
+examples:
+  biped-mfpt calibrate --controllers hzd/base hzd/cot hzd/mfpt --torque-limit 40 45 50 55 none
+  biped-mfpt calibrate --controllers smc/base smc/mfpt --torque-limit 43 46 50 \\
+      --friction 0.6 0.65 --slip-duration 0 0.003 0.005 0.007 --walks 400
+""",
+        "output",
+    )
+    calibrate.add_argument(
+        "--controllers",
+        nargs="+",
+        default=["hzd/base", "hzd/cot", "hzd/mfpt"],
+        metavar="NAME",
+        help="what walks (default: the three of hzd)",
+    )
+    for option, values, what in (
+        ("--torque-limit", [45.0, 50.0, 55.0], "N m, or none (default: 45 50 55)"),
+        ("--friction", [0.6, 0.7], "friction coefficients, or none (default: 0.6 0.7)"),
+        ("--slip-duration", [0.0, 0.005], "s, slips that do not count yet (default: 0 0.005)"),
+    ):
+        calibrate.add_argument(
+            option,
+            type=_value(_limit, "numbers or none"),
+            nargs="+",
+            default=values,
+            metavar="X",
+            help=what,
+        )
+    calibrate.add_argument(
+        "--walks", type=_whole, default=1000, metavar="N", help="(default: %(default)s)"
+    )
+    calibrate.add_argument(
+        "--seed", type=_whole, default=1, metavar="N", help="of all walks (default: %(default)s)"
+    )
+    calibrate.add_argument(
+        "--tolerance",
+        type=_number,
+        default=1e-7,
+        metavar="TOL",
+        help="local error of the integrator, rad and rad/s (default: %(default)s)",
+    )
+
     inspect = add(
         "inspect",
         "bags:inspect",
