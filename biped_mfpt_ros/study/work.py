@@ -1,0 +1,147 @@
+"""The jobs of a study that need no mesh."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from biped_mfpt_ros.control.controller import Controller, controller
+from biped_mfpt_ros.gait.cycle import NoLimitCycle, find_limit_cycle
+from biped_mfpt_ros.gait.monte_carlo import monte_carlo
+from biped_mfpt_ros.gait.step import simulate_steps
+from biped_mfpt_ros.study.plan import Job
+from biped_mfpt_ros.study.readings import readings
+from biped_mfpt_ros.walker.outcome import Outcome
+from biped_mfpt_ros.walker.robot import WalkerModel
+
+Count = Callable[[int, int], None]
+
+_PHASE_OFF = 0.95  # section 6.3: no torque above this phase
+_MOST_STEPS = 20_000  # of a walk
+
+
+def cycle(job: Job) -> dict[str, Any]:
+    """Limit cycle on flat ground, or why there is none."""
+    try:
+        found = find_limit_cycle(
+            controller(job.controller), 0.0, readings()[job.controller].model
+        )
+    except NoLimitCycle as error:
+        return {"found": False, "reason": str(error)}
+    return {
+        "found": True,
+        "state": found.state.tolist(),
+        "period": found.period,
+        "step_length": found.step_length,
+        "speed": found.speed,
+        "cost_of_transport": found.cost_of_transport,
+        "largest_eigenvalue": float(abs(found.eigenvalues[0])),
+        "stable": found.stable,
+    }
+
+
+def walks(
+    job: Job, state: list[float], threads: int | None = None, count: Count | None = None
+) -> dict[str, Any]:
+    """Monte Carlo from the limit cycle, the first step dropped."""
+    settings = job.settings
+    start = time.perf_counter()
+    found = monte_carlo(
+        controller(job.controller),
+        math.radians(settings["at_deg"]),
+        settings["walks"],
+        settings["seed"],
+        model=replace(readings()[job.controller].model, tolerance=settings["tolerance"]),
+        state=state,
+        max_steps=_MOST_STEPS,
+        threads=threads,
+        progress=count,
+    )
+    low, high = found.confidence_interval
+    shares = sorted(found.failure_shares.items(), key=lambda item: -item[1])
+    return {
+        "mean_steps": found.mean_steps,
+        "standard_error": found.standard_error,
+        "low": low,
+        "high": high,
+        "counted_walks": int(found.counted.size),
+        "falls": found.falls,
+        "failure_shares": {code.name.lower(): share for code, share in shares},
+        "steps": int(found.steps.sum()),
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def tolerance(
+    job: Job, state: list[float], threads: int | None = None, count: Count | None = None
+) -> dict[str, Any]:
+    """Whether the same walks end alike, whatever the tolerance of the integrator."""
+    settings = job.settings
+    rows, reference = [], None
+    for done, value in enumerate(sorted(settings["tolerances"])):
+        start = time.perf_counter()
+        found = monte_carlo(
+            controller(job.controller),
+            math.radians(settings["sigma_deg"]),
+            settings["walks"],
+            settings["seed"],
+            model=replace(readings()[job.controller].model, tolerance=value),
+            state=state,
+            threads=threads,
+        )
+        seconds = time.perf_counter() - start
+        reference = reference or found
+        same = (found.steps == reference.steps) & (found.outcomes == reference.outcomes)
+        rows.append(
+            {
+                "tolerance": value,
+                "same": float(same.mean()),
+                "mean_steps": found.mean_steps,
+                "milliseconds": 1e3 * seconds * (threads or 1) / int(found.steps.sum()),
+            }
+        )
+        if count is not None:
+            count(done + 1, len(settings["tolerances"]))
+    return {"rows": rows}
+
+
+def slopes(job: Job, state: list[float]) -> dict[str, Any]:
+    """Section 6.3 on hzd/base: steps down 1 degree, and down 9 with torques off late in a step."""
+    base = controller(job.controller)
+    off = Controller(f"{base.name}/off", base.scheme, np.append(base.parameters, _PHASE_OFF))
+    model, most = readings()[job.controller].model, job.settings["steps"]
+    limitless = replace(model, torque_limit=math.inf)
+    cases = (
+        (base, 0.0, model), (base, -1.0, model), (base, -1.0, limitless),
+        (off, 0.0, model), (off, -1.0, model), (off, -9.0, model),
+    )  # fmt: skip
+    return {
+        "rows": [
+            {
+                "torques_off_late": walking is off,
+                "torque_limit": None if math.isinf(limits.torque_limit) else limits.torque_limit,
+                "slope_deg": degrees,
+                **_steps_on(walking, math.radians(degrees), limits, state, most),
+            }
+            for walking, degrees, limits in cases
+        ]
+    }
+
+
+def _steps_on(
+    walking: Controller, slope: float, model: WalkerModel, state: list[float], most: int
+) -> dict[str, Any]:
+    """Steps on a constant slope, from flat ground, until the fall."""
+    at, behind = np.array([state]), 0.0
+    for taken in range(most):
+        steps = simulate_steps(walking, at, [behind], [slope], model)
+        outcome = Outcome(int(steps.outcomes[0, 0]))
+        if outcome is not Outcome.STEP:
+            return {"steps": taken, "fell": outcome.label}
+        at, behind = steps.next_states, slope
+    return {"steps": most, "fell": None}
