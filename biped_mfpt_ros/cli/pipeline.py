@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from biped_mfpt_ros.cli import CommandError, options
 from biped_mfpt_ros.cli.kernels import compile_all
 from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
-from biped_mfpt_ros.cli.processes import Processes
+from biped_mfpt_ros.cli.processes import Child, Processes
 from biped_mfpt_ros.cli.results import estimate_row, mfpt_table, monte_carlo_result
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
@@ -31,8 +31,8 @@ from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
 from biped_mfpt_ros.report.tables import difference, number, table
 from biped_mfpt_ros.walker.robot import WalkerModel
 
-_START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
-_RESULT_TIMEOUT = 120.0  # s, for the analysis to solve the chain
+START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
+RESULT_TIMEOUT = 120.0  # s, for the analysis to solve the chain
 _MOST_SWINGS = 100_000  # of a Monte Carlo: half a minute or so
 _CURVE_POINTS = 40
 _PICTURE_STEPS = 6
@@ -79,7 +79,8 @@ def run(args: argparse.Namespace) -> None:
     with Progress(quiet=args.quiet) as progress, Processes(directory / "logs") as processes:
         compile_all(progress.say)
         progress.say(f"running in {directory}, ROS namespace {namespace}")
-        pipeline = _Pipeline(processes, progress, namespace, directory)
+        pipeline = Pipeline(processes, progress, namespace)
+        pipeline.record("recorder", directory / "bag")
         pipeline.start(workers, args.mean, args.sigma)
         result |= pipeline.mesh(settings, mean, dict(zip(sigmas, args.sigma, strict=True)))
         # The walks can have all cores, and the bag is closed whatever happens to them.
@@ -131,29 +132,40 @@ def _quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
-class _Pipeline:
-    """The nodes of a run and what is asked of them."""
+class Pipeline:
+    """The nodes of a run, as processes of their own, and what is asked of them.
 
-    def __init__(
-        self, processes: Processes, progress: Progress, namespace: str, directory: Path
-    ) -> None:
+    Parameters
+    ----------
+    processes : Processes
+        Where they are started.
+    progress : Progress
+        Where it is told what they do.
+    namespace : str
+        Theirs, with a leading slash.
+    """
+
+    def __init__(self, processes: Processes, progress: Progress, namespace: str) -> None:
         self._processes = processes
         self._progress = progress
         self._namespace = namespace
-        self._bag = directory / "bag"
         self._simulators: set[str] = set()
 
-    def start(self, workers: int, mean_deg: float, sigma_deg: list[float]) -> None:
-        """Start the nodes."""
-        # The recorder is stopped last, so that it hears what the others say to the end.
-        self._node("recorder", "recorder", last=True, bag=_quoted(str(self._bag.absolute())))
+    def record(self, name: str, bag: Path, *, earlier: bool = True) -> Child:
+        """Start a recorder, of what was published before it too if ``earlier``."""
+        # It is stopped last, so that it hears what the others say to the end.
+        quoted = _quoted(str(bag.absolute()))
+        return self._node(name, "recorder", last=True, bag=quoted, earlier=str(earlier).lower())
+
+    def start(self, workers: int, mean_deg: float, sigma_deg: Sequence[float]) -> None:
+        """Start all other nodes."""
         self._node("mesher", "mesher")
-        self._node("analysis", "analysis", mu_s_deg=mean_deg, sigma_s_deg=sigma_deg)
+        self._node("analysis", "analysis", mu_s_deg=mean_deg, sigma_s_deg=list(sigma_deg))
         self._simulators = {f"simulator_{i}" for i in range(1, workers + 1)}
         for name in sorted(self._simulators):
             self._node(name, "simulator")
 
-    def _node(self, name: str, executable: str, last: bool = False, **parameters: object) -> None:
+    def _node(self, name: str, executable: str, last: bool = False, **parameters: object) -> Child:
         command = [sys.executable, "-m", "biped_mfpt_ros.cli", "node", executable]
         command[-1:-1] = ["--end-with", str(os.getpid())]
         # The log's topic is the same for all nodes on the graph, if it is not brought in here.
@@ -162,14 +174,14 @@ class _Pipeline:
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         environment = os.environ | {"RCUTILS_COLORIZED_OUTPUT": "0", "PYTHONUNBUFFERED": "1"}
-        self._processes.start(name, command, environment=environment, last=last)
+        return self._processes.start(name, command, environment=environment, last=last)
 
     def mesh(self, settings: Any, mean: float, sigmas: dict[float, float]) -> dict[str, Any]:
         """Grow the mesh and get its MFPT for each sigma (rad to degrees)."""
         from biped_mfpt_ros.cli.client import Client
 
-        with Client(self._namespace, self._watch) as client:
-            client.wait(partial(self._up, client), _START_TIMEOUT, "the nodes to come up")
+        with Client(self._namespace, self.watch) as client:
+            client.wait(partial(self.up, client), START_TIMEOUT, "the nodes to come up")
             text = MeshProgress()
 
             def feedback(message: Any) -> None:
@@ -185,7 +197,7 @@ class _Pipeline:
 
             grown = client.grow_mesh(settings, feedback)
             self._progress.show("waiting for the analysis")
-            estimates = client.published_mfpt(grown.mesh_id, mean, list(sigmas), _RESULT_TIMEOUT)
+            estimates = client.published_mfpt(grown.mesh_id, mean, list(sigmas), RESULT_TIMEOUT)
             low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)
             curve = client.compute_mfpt(
                 grown.mesh_id, mean, list(np.linspace(low, high, _CURVE_POINTS))
@@ -207,13 +219,14 @@ class _Pipeline:
                 "curve": [{"sigma_s": e.sigma_s, "mfpt": e.mfpt} for e in curve],
             }
 
-    def _up(self, client: Any) -> bool:
+    def up(self, client: Any) -> bool:
+        """Whether all nodes are there."""
         peers = client.peers()
         missing = [what for what, there in asdict(peers).items() if not there]
         self._progress.show(f"starting; waiting for {', '.join(missing)}")
         return not missing
 
-    def _watch(self) -> None:
+    def watch(self) -> None:
         """End the run when a node that it cannot do without has ended."""
         for child in self._processes.newly_ended():
             self._simulators.discard(child.name)

@@ -117,6 +117,11 @@ class Processes:
         self._reported.update(child.name for child in ended)
         return ended
 
+    def end(self, child: Child) -> None:
+        """Ask one child to end, without waiting for it; `newly_ended` will not report it."""
+        self._reported.add(child.name)
+        _signal(child, signal.SIGTERM)
+
     def stop(self) -> None:
         """Stop all children, in at most 5 s."""
         with self._held():

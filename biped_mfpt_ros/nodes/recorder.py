@@ -54,6 +54,9 @@ class RecorderParameters(NodeParameters):
     further_topics: str = parameter(
         "/rosout", "topics to record beside the pipeline's, separated by spaces"
     )
+    earlier: bool = parameter(
+        True, "also record what is kept on latched topics from before the recorder started"
+    )
     flush_period: float = parameter(
         0.5, "s, after which a message survives the recorder's death at the latest", 0.01, 1.0
     )
@@ -92,6 +95,7 @@ class Recorder(Node):
                 self._awaited.append(self.resolve_topic_name(topic))
             except _rclpy.RCLError:
                 raise InputError("further_topics", topic, "names of topics") from None
+        self._earlier = parameters.earlier
         self._recordings: list[_Recording] = []
         self._bag = BagWriter(parameters.bag or time.strftime("pipeline_%Y_%m_%d-%H_%M_%S"))
         self.failed = False
@@ -142,6 +146,8 @@ class Recorder(Node):
             [_profile(publisher.qos_profile) for publisher in publishers],
         )
         qos = _compatible(publishers)
+        if not self._earlier:
+            qos.durability = QoSDurabilityPolicy.VOLATILE
         latched = qos.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL
         check = SequenceCheck(complete=latched) if _is_counted(message_class) else None
         recording = _Recording(topic, None, check)
