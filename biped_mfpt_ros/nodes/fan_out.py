@@ -24,8 +24,8 @@ from biped_mfpt_ros.nodes.messages import packed, steps_from
 
 _POLL = 0.05  # s, between two looks for simulators that came, went, or are late
 _FIRST_SWING = 1e-4  # s, what a swing is taken to cost until answers tell
-_LEAST_SHARE = 0.1  # of a full chunk, below which splitting costs more than it balances
-_MOST_SWINGS = 1000  # in a chunk: keeps answers near the 1 MB that travel best
+_LEAST_SHARE = 0.2  # of a full chunk, below which splitting costs more than it balances
+_MOST_OUTCOMES = 40_000  # in a chunk: keeps answers near the 1 MB that travel best
 _MANY_TIMES = 10.0  # how much longer than expected an answer may take before it is late
 _MOST_PATIENCE = 16.0  # by which that may grow
 _MOST_FAILURES = 3  # refusals in a row before a simulator is dropped
@@ -102,15 +102,15 @@ class FanOutSettings:
     chunk_seconds : float
         s, work in a full chunk.
     in_flight : int
-        Chunks that a simulator has at once: one that it computes, the others on their way.
+        Chunks that a simulator has at once: one that it computes, the others wait for it.
     timeout : float
         s, after which an answer may be late. It is if it also takes 10 times what it should.
     wait_seconds : float
         s, for how long to wait for a simulator when there is none that answers.
     """
 
-    chunk_seconds: float = 0.02
-    in_flight: int = 3
+    chunk_seconds: float = 0.05
+    in_flight: int = 2
     timeout: float = 1.0
     wait_seconds: float = 10.0
 
@@ -269,7 +269,8 @@ class FanOut:
         simulators = self._simulators.values()
         known = [s.swing_seconds for s in simulators if s.swing_seconds]
         swing = sum(known) / len(known) if known else _FIRST_SWING
-        full = min(max(1, round(self._settings.chunk_seconds / swing)), _MOST_SWINGS)
+        full = round(self._settings.chunk_seconds / swing)
+        full = max(1, min(full, _MOST_OUTCOMES // self._slopes))
         least = max(1, round(_LEAST_SHARE * full))
         share = math.ceil(remaining / (2 * max(1, self.simulators)))
         return min(remaining, max(least, min(full, share)))

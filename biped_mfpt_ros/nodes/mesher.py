@@ -55,8 +55,8 @@ class MesherParameters(NodeParameters):
     simulator_timeout: float = parameter(
         1.0, "s, after which a simulator that also takes 10 times too long is late", 0.01, 1e6
     )
-    chunk_seconds: float = parameter(0.02, "s, work in a full request", 1e-3, 10.0)
-    chunks_in_flight: int = parameter(3, "requests that each simulator has at once", 1, 100)
+    chunk_seconds: float = parameter(0.05, "s, work in a full request", 1e-3, 10.0)
+    chunks_in_flight: int = parameter(2, "requests that each simulator has at once", 1, 100)
     progress_period: float = parameter(0.25, "s, between two progress messages", 0.05, 60.0)
     max_queued: int = parameter(
         16, "goals that may wait for their turn; further ones are rejected", 0, 1000
@@ -122,6 +122,7 @@ class Mesher(Node):
         """Stop the mesh that grows, if one does."""
         self.stopping = True
         self._thread.shutdown(wait=True, cancel_futures=True)
+        self._action.destroy()
 
     def _on_goal(self, goal: GrowMesh.Goal) -> GoalResponse:
         most = self.declared.now.max_queued

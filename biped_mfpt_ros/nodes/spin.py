@@ -38,8 +38,18 @@ def prepare_environment() -> None:
         )
 
 
-def _interrupt(signum: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+class _Interrupt:
+    """Signal handler that raises KeyboardInterrupt until it is told to hold."""
+
+    def __init__(self) -> None:
+        self.received = False
+        self.hold = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal."""
+        self.received = True
+        if not self.hold:
+            raise KeyboardInterrupt
 
 
 def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
@@ -59,8 +69,10 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
     int
         Exit code: 0 after a clean stop, 2 if the node could not start as configured.
     """
-    # Until the node spins, a signal raises in Python: rclpy's own handlers only act on a spin.
-    signal.signal(signal.SIGTERM, _interrupt)
+    # rclpy's own handlers wake a node that spins, and call these. Before, these alone are there.
+    interrupt = _Interrupt()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupt)
     node: Node | None = None
     try:
         prepare_environment()
@@ -78,14 +90,16 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
                 f"false, unless this ROS 2 has DDS security and the enclave exists ({error})",
             ) from error
         install_signal_handlers(SignalHandlerOptions.ALL)
-        _spin(node)
+        # What is raised inside a callback of the compiler is swallowed there.
+        if not interrupt.received:
+            _spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except InputError as error:
         print(f"{sys.argv[0]}: {error}", file=sys.stderr)
         return 2
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the rest is quick and must not be cut off
+        interrupt.hold = True  # cleaning up is not to be cut off
         if node is not None:
             close = getattr(node, "close", None)
             if close is not None:

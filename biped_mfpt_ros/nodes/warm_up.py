@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numba
@@ -50,10 +50,15 @@ def compiled(log: Callable[[str], object], what: str) -> Iterator[None]:
     """
     directory = Path(numba.config.CACHE_DIR)
     directory.mkdir(parents=True, exist_ok=True)
-    with open(directory / "compiling.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        start = time.monotonic()
-        with announced(log, what) as announcer:
-            yield
+    # The directory is another one for every state of the kernel sources, so this stays true.
+    done = directory / f"{what.replace(' ', '-')}.compiled"
+    start = time.monotonic()
+    with ExitStack() as stack:
+        if not done.exists():
+            lock = stack.enter_context(open(directory / "compiling.lock", "w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        announcer = stack.enter_context(announced(log, what))
+        yield
+        done.touch()
     if announcer.said:
         log(f"compiled {what} in {time.monotonic() - start:.1f} s")
