@@ -6,7 +6,7 @@ ARGS ?=
 # An ordinary ROS 2 that is active in this shell must not leak into .venv, which has its own.
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH
 
-.PHONY: help setup run test lint clean
+.PHONY: help setup run reproduce test lint clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
@@ -16,6 +16,9 @@ setup: ## set up .venv: ROS 2 wheels, messages, this package (first time about 9
 
 run: setup ## walk, mesh, compute the MFPT over ROS 2, record it; ARGS='--help' lists the options
 	@$(BIN)/biped-mfpt run $(ARGS)
+
+reproduce: setup ## the paper's tables and figures in runs/reproduce (10 min); ARGS='--quick': 1 min
+	@$(BIN)/biped-mfpt reproduce $(ARGS)
 
 test: setup ## run the tests but the slow ones; ARGS='-m slow' runs those
 	@$(BIN)/python -m pytest -q -m 'not slow' $(ARGS)

@@ -408,6 +408,60 @@ examples:
         help="degrees, ground ahead, negative is downhill (default: 0)",
     )
 
+    reproduce = add(
+        "reproduce",
+        "reproduce:reproduce",
+        "compute the paper's Tables 1 to 5 and Figures 2 and 3, each number beside the paper's",
+        """
+Meshes are grown by the ROS 2 pipeline with all simulators, with a bag for each; walks and limit
+cycles are computed in this process. Each result is kept as soon as it is there: the same command
+again goes on where it was stopped, and is done at once when nothing is missing. Results of other
+settings, or of another step map, are computed anew.
+
+The directory then holds report.html (one file, with all pictures), report.json, a .csv for each
+table and figure, results/, bags/ and logs/. On two cores it takes 10 minutes, 1 with --quick.
+
+examples:
+  biped-mfpt reproduce
+  biped-mfpt reproduce --quick
+  biped-mfpt reproduce --controllers hzd/base hzd/cot --output /tmp/report --json
+""",
+        "output",
+    )
+    reproduce.add_argument(
+        "--quick", action="store_true", help="coarser meshes, a tenth of the walks"
+    )
+    reproduce.add_argument(
+        "--controllers",
+        nargs="+",
+        metavar="NAME",
+        help="what to study, see `biped-mfpt controllers` (default: all six)",
+    )
+    reproduce.add_argument(
+        "--walks",
+        type=_whole,
+        metavar="N",
+        help="Monte Carlo walks of Tables 2 and 4 (default: 10000, with --quick 1000)",
+    )
+    reproduce.add_argument(
+        "--workers",
+        type=_whole,
+        metavar="N",
+        help="simulator processes, and threads of the walks (default: one for each core)",
+    )
+    reproduce.add_argument(
+        "--output",
+        metavar="DIR",
+        help="directory of the report and of all results; may exist (default: runs/reproduce, "
+        "with --quick runs/reproduce-quick)",
+    )
+    reproduce.add_argument(
+        "--no-pictures",
+        dest="pictures",
+        action="store_false",
+        help="leave out the pictures of gaits and meshes",
+    )
+
     calibrate = add(
         "calibrate",
         "calibrate:run",

@@ -1,0 +1,376 @@
+"""`biped-mfpt reproduce`: the paper's tables and figures, each number beside the paper's."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from biped_mfpt_ros.cli import CommandError, options
+from biped_mfpt_ros.cli.kernels import compile_all
+from biped_mfpt_ros.cli.node import require_ros
+from biped_mfpt_ros.cli.output import json_text, plain
+from biped_mfpt_ros.cli.pipeline import RESULT_TIMEOUT, START_TIMEOUT, Pipeline
+from biped_mfpt_ros.cli.processes import Child, Processes
+from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.jit import STEP_MAP
+from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
+from biped_mfpt_ros.report.tables import difference, table
+from biped_mfpt_ros.study import work
+from biped_mfpt_ros.study.comparison import Results, curves, tables
+from biped_mfpt_ros.study.plan import SIGMA_DEG, Job, Plan, make_plan, scheme_of
+from biped_mfpt_ros.study.readings import readings
+from biped_mfpt_ros.study.store import Store
+from biped_mfpt_ros.walker.outcome import Outcome
+from biped_mfpt_ros.walker.terrain import slope_set
+
+_MOST_STATES = 200_000
+_POLL = 0.05  # s
+
+
+def reproduce(args: argparse.Namespace) -> None:
+    """Compute what is missing, then write the report."""
+    start = time.monotonic()
+    plan = make_plan(args.controllers, quick=args.quick, walks=args.walks)
+    workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
+    if workers < 1:
+        raise InputError("--workers", workers, "a whole number >= 1")
+    require_ros()
+    directory = Path(args.output or ("runs/reproduce-quick" if args.quick else "runs/reproduce"))
+    store = Store(directory / "results")
+    with Progress(quiet=args.quiet) as progress:
+        study = _Study(plan, store, progress)
+        study.load(directory)
+        if study.missing:
+            with Processes(directory / "logs") as processes:
+                compile_all(progress.say)
+                _compute(study, processes, directory, workers)
+        seconds = {"computing": time.monotonic() - start}
+        report = _write(study, directory, workers, seconds, args, progress)
+    report["seconds"] |= seconds
+    print(json_text(report) if args.json else _text(report, directory))
+
+
+# Doing the jobs ---------------------------------------------------------------------------------
+
+
+class _Study:
+    """The jobs of a plan: which are done, and how far the rest has come."""
+
+    def __init__(self, plan: Plan, store: Store, progress: Progress) -> None:
+        self.plan = plan
+        self.results: dict[str, dict[str, Any]] = {}
+        self.seconds: dict[str, float] = {}
+        self.progress = progress
+        self._store = store
+        self._start = time.monotonic()
+        self._before = 0
+
+    def load(self, directory: Path) -> None:
+        """Take what earlier runs left."""
+        for job in self.plan.jobs:
+            result = self._store.get(job)
+            # A mesh is done if its bag is there.
+            if result is not None and (directory / result.get("bag", ".")).exists():
+                self.results[job.name] = result
+        self._before = len(self.results)
+        if self._before:
+            self.progress.say(
+                f"{self._before} of {len(self.plan.jobs)} results are there from an earlier run"
+            )
+
+    @property
+    def missing(self) -> list[Job]:
+        """The jobs that are to be done."""
+        return [job for job in self.plan.jobs if job.name not in self.results]
+
+    def state(self, name: str) -> list[float] | None:
+        """State on the limit cycle of a controller, once that is known; None without one."""
+        (job,) = self.plan.of("cycle", name)
+        state: list[float] | None = self.results[job.name].get("state")
+        return state
+
+    def finish(self, job: Job, result: dict[str, Any], seconds: float) -> None:
+        """Keep a result."""
+        result = plain(result)
+        self._store.put(job, result)
+        self.results[job.name] = result
+        self.seconds[job.kind] = self.seconds.get(job.kind, 0.0) + seconds
+
+    def show(self, job: Job, details: str = "", share: float = 0.0) -> None:
+        """Show how far all jobs have come, and what this one of them does."""
+        done = len(self.results)
+        missing = self.missing
+        elapsed = time.monotonic() - self._start
+        ended = [j for j in self.plan.jobs if j.name in self.results][self._before :]
+        text = f"{done} of {len(self.plan.jobs)} jobs"
+        # What has been done took so much more or less than expected; so will the rest, probably.
+        expected = sum(j.seconds for j in ended) + share * job.seconds
+        left = sum(j.seconds for j in missing) - share * job.seconds
+        if expected > 5.0:
+            text += f", {60.0 * len(ended) / elapsed:.3g}/min"
+            text += f", {duration_text(left * elapsed / expected)} left"
+        else:
+            text += f", about {duration_text(left)} left"
+        self.progress.show(f"{text}; {job.title}{': ' if details else ''}{details}")
+
+    def count(self, job: Job) -> Callable[[int, int], None]:
+        """What tells how many of a job's parts are done."""
+        return lambda done, total: self.show(job, f"{100.0 * done / total:.0f} %", done / total)
+
+
+def _compute(study: _Study, processes: Processes, directory: Path, workers: int) -> None:
+    """Do the jobs that are missing: cycles, then meshes by the pipeline, then what walks here."""
+    for job in study.missing:
+        if job.kind == "cycle":
+            study.show(job)
+            _timed(study, job, lambda job=job: work.cycle(job))
+    # Without a gait on flat ground there is nothing to start from; the tables say so.
+    jobs = [job for job in study.missing if study.state(job.controller) is not None]
+    meshes = [job for job in jobs if job.kind == "mesh"]
+    if meshes:
+        _meshes(study, meshes, processes, directory, workers)
+    for job in jobs:
+        state = study.state(job.controller)
+        assert state is not None
+        study.show(job)
+        if job.kind == "walks":
+            _timed(study, job, partial(work.walks, job, state, workers, study.count(job)))
+        elif job.kind == "tolerance":
+            _timed(study, job, partial(work.tolerance, job, state, workers, study.count(job)))
+        elif job.kind == "slopes":
+            _timed(study, job, partial(work.slopes, job, state))
+
+
+def _timed(study: _Study, job: Job, do: Callable[[], dict[str, Any]]) -> None:
+    start = time.monotonic()
+    result = do()
+    study.finish(job, result, time.monotonic() - start)
+
+
+@dataclass
+class _Recording:
+    """A mesh that is done but for its bag."""
+
+    job: Job
+    result: dict[str, Any]
+    recorder: Child
+    bag: Path
+    seconds: float
+
+
+def _meshes(
+    study: _Study, jobs: list[Job], processes: Processes, directory: Path, workers: int
+) -> None:
+    """Grow meshes with the pipeline's nodes, which are started once, and a recorder for each."""
+    from biped_mfpt_ros.cli.client import Client
+    from biped_mfpt_ros.nodes.spin import prepare_environment
+
+    prepare_environment()
+    bags = directory / "bags"
+    bags.mkdir(exist_ok=True)
+    namespace = f"/reproduce_{os.getpid()}_{time.time_ns() % 10**9}"
+    pipeline = Pipeline(processes, study.progress, namespace)
+    started = time.monotonic()
+    published = sorted({s for job in jobs for s in SIGMA_DEG[scheme_of(job.controller)]})
+    pipeline.start(workers, 0.0, published)
+    last: _Recording | None = None
+    with Client(namespace, pipeline.watch) as client:
+        for i, job in enumerate(jobs):
+            start = time.monotonic()
+            bag = bags / job.name
+            if bag.exists():
+                shutil.rmtree(bag)  # of a mesh that was stopped
+            name = f"recorder_{i}"
+            recorder = pipeline.record(name, bag, earlier=False)
+            # The bag of the mesh before is closed and checked while this recorder starts.
+            _close(study, processes, last)
+            client.wait(partial(pipeline.up, client), START_TIMEOUT, "the nodes to come up")
+            if not i:
+                study.seconds["starting nodes"] = time.monotonic() - started
+                start = time.monotonic()
+            result = _grow(study, job, client, published)
+            processes.end(recorder)
+            last = _Recording(
+                job, result | {"bag": str(bag.relative_to(directory))}, recorder, bag,
+                time.monotonic() - start,
+            )  # fmt: skip
+    _close(study, processes, last)
+    # The walks can have all cores.
+    study.show(jobs[-1], "stopping the nodes")
+    processes.stop()
+
+
+def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[str, Any]:
+    """Grow a mesh, and have the analysis compute its MFPT."""
+    from biped_mfpt_ros.nodes.messages import MeshSettings
+
+    state = study.state(job.controller)
+    settings = MeshSettings(
+        controller(job.controller),
+        readings()[job.controller].model,
+        slope_set(job.settings["slope_step_deg"]),
+        job.settings["threshold"],
+        initial_state=np.array(state),
+        max_states=_MOST_STATES,
+    )
+    text = MeshProgress()
+
+    def feedback(message: Any) -> None:
+        line = text.text(
+            generation=message.generation,
+            states=message.states,
+            frontier=message.frontier,
+            swings_per_second=message.swings_per_second,
+        )
+        study.show(job, line.removeprefix("mesh: "))
+
+    study.show(job)
+    grown = client.grow_mesh(settings, feedback)
+    study.show(job, "waiting for the analysis")
+    radians = {deg: options.spread("sigma", deg) for deg in published}
+    client.published_mfpt(grown.mesh_id, 0.0, list(radians.values()), RESULT_TIMEOUT)
+    sigma_deg = job.settings["sigma_deg"]
+    estimates = client.compute_mfpt(
+        grown.mesh_id, 0.0, [options.spread("sigma", deg) for deg in sigma_deg]
+    )
+    return {
+        "mesh_id": grown.mesh_id,
+        "states": grown.states,
+        "generations": grown.generations,
+        "swings": grown.swings,
+        "swings_per_second": grown.swings / grown.seconds,
+        "seconds": grown.seconds,
+        "step_map_seconds": grown.step_map_seconds,
+        "mfpt": [estimate.mfpt for estimate in estimates],
+        "failure_probability": [estimate.failure_probability for estimate in estimates],
+        "failure_shares": [
+            {
+                Outcome(code).name.lower(): share
+                for code, share in zip(e.failure_codes, e.failure_shares, strict=True)
+                if share > 0.0
+            }
+            for e in estimates
+        ],
+    }
+
+
+def _close(study: _Study, processes: Processes, recording: _Recording | None) -> None:
+    """Wait for a recorder to end, make sure that the mesh is in the bag, and keep the result."""
+    if recording is None:
+        return
+    from biped_mfpt_ros.bag import read_meshes
+
+    start = time.monotonic()
+    if recording.recorder.process.wait(RESULT_TIMEOUT) != 0:
+        raise CommandError(
+            f"{recording.recorder.name} {recording.recorder.ending()}:\n"
+            f"{recording.recorder.log_tail()}"
+        )
+    found = read_meshes(recording.bag).get(recording.result["mesh_id"])
+    if found is None or found.mesh is None:
+        why = "not there" if found is None else found.problem
+        raise CommandError(
+            f"{recording.bag}: the mesh cannot be read back ({why}); the same command again "
+            "records it anew and goes on from here"
+        )
+    study.finish(recording.job, recording.result, recording.seconds + time.monotonic() - start)
+
+
+# The report -------------------------------------------------------------------------------------
+
+
+def _write(
+    study: _Study,
+    directory: Path,
+    workers: int,
+    seconds: dict[str, float],
+    args: argparse.Namespace,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write HTML, JSON and CSV; return what is in the JSON."""
+    from biped_mfpt_ros.report import html
+
+    progress.show("writing the report")
+    start = time.monotonic()
+    results = Results(study.plan, study.results)
+    found, lines = tables(results), curves(results)
+    report: dict[str, Any] = {
+        "controllers": study.plan.controllers,
+        "quick": study.plan.quick,
+        "walks": study.plan.walks,
+        "workers": workers,
+        "step_map": STEP_MAP,
+        "tables": {t.name: t.to_dict() for t in found},
+        "curves": [vars(curve) for curve in lines],
+        "results": {
+            job.name: {"kind": job.kind, "controller": job.controller}
+            | {"settings": job.settings, "result": study.results[job.name]}
+            for job in study.plan.jobs
+            if job.name in study.results
+        },
+    }
+    for t in found:
+        (directory / f"{t.name}.csv").write_text(t.csv())
+    for number, scheme in ((2, "hzd"), (3, "smc")):
+        rows = ["controller,sigma_s_deg,mfpt"]
+        for curve in lines:
+            if scheme_of(curve.controller) == scheme:
+                points = zip(curve.sigma_deg, curve.mfpt, strict=True)
+                rows += [f"{curve.controller},{at!r},{mfpt!r}" for at, mfpt in points]
+        if len(rows) > 1:
+            (directory / f"figure{number}.csv").write_text("\n".join(rows) + "\n")
+    pictures: dict[str, list[Any]] = {}
+    if args.pictures:
+        pictures = _pictures(study, directory, progress)
+    seconds["drawing"] = time.monotonic() - start
+    report["seconds"] = {**study.seconds, **seconds}
+    page = html.page(results, found, lines, pictures, report["seconds"])
+    _replace(directory / "report.html", page)
+    _replace(directory / "report.json", json_text(report) + "\n")
+    return report
+
+
+def _replace(path: Path, text: str) -> None:
+    beside = path.with_suffix(path.suffix + ".tmp")
+    beside.write_text(text)
+    beside.replace(path)
+
+
+def _pictures(study: _Study, directory: Path, progress: Progress) -> dict[str, list[Any]]:
+    """Pictures of each controller's gait and mesh, `report.style.Picture`, by its name."""
+    return {}
+
+
+def _text(report: dict[str, Any], directory: Path) -> str:
+    """What a reader wants to know at once."""
+    parts = []
+    if "holds" in report["tables"]:
+        rows = [
+            (
+                row["number"], row["paper"], row["here"], row["by"],
+                "" if row["difference"] is None else difference(row["here"], row["paper"]),
+                row["verdict"],
+            )
+            for row in report["tables"]["holds"]["rows"]
+        ]  # fmt: skip
+        parts.append(
+            table(("the paper's number", "paper", "here", "by", "difference", "verdict"), rows)
+        )
+    times = [f"{name} {duration_text(value)}" for name, value in report["seconds"].items()]
+    parts.append("times: " + ", ".join(times))
+    parts.append(
+        f"report   {directory / 'report.html'}\n"
+        f"data     {directory / 'report.json'} and {directory}/*.csv\n"
+        f"bags     {directory / 'bags'}"
+    )
+    return "\n\n".join(parts)
