@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 NODES = {"simulator", "mesher", "analysis", "recorder"}
 
 ROSDEP_KEYS = {
+    "PIL": "python3-pil",
     "hypothesis": "python3-hypothesis",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
@@ -31,7 +32,7 @@ ROSDEP_KEYS = {
     "zstandard": "mcap-ros2-support",
 }
 """Of what is on the Python package index. mcap, zstandard, mpmath: the key that brings them."""
-PIP_NAMES = {"yaml": "pyyaml"}
+PIP_NAMES = {"PIL": "pillow", "yaml": "pyyaml"}
 """Import name to name on the package index, where they differ."""
 
 ENTRY_POINTS = importlib.metadata.distribution(PACKAGE).entry_points.select(group="console_scripts")

@@ -238,7 +238,8 @@ def draw_walk(axes: Axes, walking: Walk) -> None:
     if walking.outcome is not Outcome.STEP:
         at = where_it_falls(walking)
         axes.plot(*at, "o", color=PAPER, markersize=9, fillstyle="none", markeredgewidth=1.8)
-        axes.annotate(walking.outcome.label, at, (8, 10), textcoords="offset points", color=PAPER)
+        corner = {"transform": axes.transAxes, "ha": "right", "va": "top"}
+        axes.text(1.0, 1.0, walking.outcome.label, color=PAPER, **corner)
     axes.set_xlabel("distance, m")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(left=False, labelleft=False)
