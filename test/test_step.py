@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
+from scipy.integrate import RK45, solve_ivp
 
 from biped_mfpt_ros.control.controller import Controller, controller, controller_names
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.gait import integrate
 from biped_mfpt_ros.gait.closed_loop import closed_loop
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.step import simulate_steps
@@ -61,6 +62,14 @@ def walk(control, state, slope, steps, model):
             return taken
         state, previous = result.next_states[0], slope
     return steps
+
+
+def test_coefficients_of_the_integrator():
+    """To rounding: scipy tabulates the same pair."""
+    assert np.allclose(integrate._A[:6, :5], RK45.A, rtol=1e-15, atol=0)
+    assert np.allclose(integrate._A[6], RK45.B, rtol=1e-15, atol=0)
+    assert np.allclose(integrate._E, RK45.E, rtol=1e-14, atol=0)
+    assert np.allclose(integrate._P, RK45.P, rtol=1e-14, atol=0)
 
 
 def test_a_swing_agrees_with_scipy():

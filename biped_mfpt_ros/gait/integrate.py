@@ -1,8 +1,12 @@
 """One step of the integrator, and its dense output.
 
-Dormand and Prince's pair of order 5(4) with Shampine's quartic dense output, with the coefficients
-that scipy tabulates. A pair of order 8 was tried: on smooth swings it takes half the evaluations,
-but where torques saturate the right-hand side has kinks, and there it takes more.
+Dormand and Prince's pair of order 5(4) with Shampine's quartic dense output [1]_. A pair of order 8
+was tried: on smooth swings it takes half the evaluations, but where torques saturate the right-hand
+side has kinks, and there it takes more.
+
+References
+----------
+.. [1] L. F. Shampine, "Some Practical Runge-Kutta Formulas", Mathematics of Computation 46 (1986).
 """
 
 from __future__ import annotations
@@ -10,7 +14,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.integrate import RK45
 
 from biped_mfpt_ros.gait.closed_loop import closed_loop, margin
 from biped_mfpt_ros.jit import kernel
@@ -22,10 +25,36 @@ STAGES = 6
 """Evaluations of a step; one more row holds the derivative at its end, the next step's first."""
 ORDER = 5
 
-_A = np.zeros((STAGES + 1, STAGES))
-_A[:STAGES, : STAGES - 1] = RK45.A
-_A[STAGES] = RK45.B
-_E, _P = RK45.E, RK45.P
+# Written out, and compared with scipy's in the tests: importing scipy.integrate for them would cost
+# every process half a second.
+_A = np.array(
+    [
+        [0, 0, 0, 0, 0, 0],
+        [1 / 5, 0, 0, 0, 0, 0],
+        [3 / 40, 9 / 40, 0, 0, 0, 0],
+        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+_E = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40])
+_P = np.array(
+    [
+        [1, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
+        [0, 0, 0, 0],
+        [0, 131558114200 / 32700410799, -68118460800 / 10900136933, 87487479700 / 32700410799],
+        [0, -1754552775 / 470086768, 14199869525 / 1410260304, -10690763975 / 1880347072],
+        [
+            0,
+            127303824393 / 49829197408,
+            -318862633887 / 49829197408,
+            701980252875 / 199316789632,
+        ],
+        [0, -282668133 / 205662961, 2019193451 / 616988883, -1453857185 / 822651844],
+        [0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
+    ]
+)
 
 _KINK = 100.0  # by which the error is taken for more in a step with a kink
 

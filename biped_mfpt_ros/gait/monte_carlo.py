@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -200,11 +201,13 @@ def monte_carlo(
     steps = np.zeros(walks, dtype=np.int64)
     outcomes = np.zeros(walks, dtype=np.uint8)
 
+    stop = threading.Event()
+
     def run(block: np.ndarray) -> int:
         randoms = [np.random.Generator(np.random.PCG64([seed, int(n)])) for n in block]
         upright = np.arange(block.size)
         length = 8
-        while upright.size:
+        while upright.size and not stop.is_set():
             length = min(length, max_steps - int(steps[block[upright[0]]]))
             if length == 0:
                 break
@@ -223,8 +226,11 @@ def monte_carlo(
     blocks = np.split(np.arange(walks), np.arange(_BLOCK_WALKS, walks, _BLOCK_WALKS))
     ended = 0
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        for size in pool.map(run, blocks):
-            ended += size
-            if progress is not None:
-                progress(ended, walks)
+        try:
+            for size in pool.map(run, blocks):
+                ended += size
+                if progress is not None:
+                    progress(ended, walks)
+        finally:  # an interrupt does not wait for walks that have not fallen yet
+            stop.set()
     return MonteCarlo(steps, outcomes)
