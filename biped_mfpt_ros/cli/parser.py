@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 from biped_mfpt_ros import __version__
 
 CLI = "biped_mfpt_ros.cli"
+PICTURES = ("gait", "animation", "phase", "torques", "mesh", "distribution", "falls")
 NODES = ("simulator", "mesher", "analysis", "recorder")
 
 DEFAULT_CONTROLLER = "hzd/mfpt"
@@ -429,7 +430,7 @@ examples:
         "output",
     )
     reproduce.add_argument(
-        "--quick", action="store_true", help="coarser meshes, a tenth of the walks"
+        "--quick", action="store_true", help="coarser meshes, fewer walks, no animations"
     )
     reproduce.add_argument(
         "--controllers",
@@ -441,7 +442,7 @@ examples:
         "--walks",
         type=_whole,
         metavar="N",
-        help="Monte Carlo walks of Tables 2 and 4 (default: 10000, with --quick 1000)",
+        help="Monte Carlo walks of Tables 2 and 4 (default: 10000, with --quick 500)",
     )
     reproduce.add_argument(
         "--workers",
@@ -510,6 +511,53 @@ examples:
         default=1e-7,
         metavar="TOL",
         help="local error of the integrator, rad and rad/s (default: %(default)s)",
+    )
+
+    picture = add(
+        "picture",
+        "picture:picture",
+        "draw a gait, an animation, phases, torques, a mesh or falls",
+        """
+Of a walk on random slopes, its last steps and its fall; the walk is one of those of `biped-mfpt
+monte-carlo` with the same seed:
+  gait          stick figures                       animation     the same as a GIF
+  phase         rates over angles, limit cycle      torques       of the joints, and ground forces
+Of a mesh and the Markov chain over it:
+  mesh          its states on the principal plane   distribution  the metastable one, over the mesh
+  falls         where and why the controller falls
+
+examples:
+  biped-mfpt picture animation --controller hzd/mfpt --sigma 2 --number 3 --output walk.gif
+  biped-mfpt picture falls --controller hzd/base --sigma 1 --threshold 0.02 --output falls.png
+""",
+        "walker",
+        "terrain",
+        "mesh",
+        "output",
+    )
+    picture.add_argument("kind", choices=PICTURES, metavar="KIND", help=", ".join(PICTURES))
+    picture.add_argument(
+        "--output", required=True, metavar="FILE", help="new file, .gif for an animation, or .png"
+    )
+    picture.add_argument(
+        "--sigma",
+        type=_number,
+        default=2.0,
+        metavar="DEG",
+        help="degrees, standard deviation of the slope (default: %(default)g)",
+    )
+    picture.add_argument(
+        "--seed", type=_whole, default=1, metavar="N", help="of all walks (default: %(default)s)"
+    )
+    picture.add_argument(
+        "--number", type=_whole, default=0, metavar="N", help="of the walk (default: %(default)s)"
+    )
+    picture.add_argument(
+        "--last-steps",
+        type=_whole,
+        default=8,
+        metavar="N",
+        help="how much of the walk to draw (default: %(default)s)",
     )
 
     inspect = add(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import base64
 import os
 import shutil
 import time
@@ -24,6 +25,7 @@ from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import STEP_MAP
 from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
+from biped_mfpt_ros.report.style import Picture
 from biped_mfpt_ros.report.tables import difference, table
 from biped_mfpt_ros.study import work
 from biped_mfpt_ros.study.comparison import Results, curves, tables
@@ -40,7 +42,14 @@ _POLL = 0.05  # s
 def reproduce(args: argparse.Namespace) -> None:
     """Compute what is missing, then write the report."""
     start = time.monotonic()
-    plan = make_plan(args.controllers, quick=args.quick, walks=args.walks)
+    from biped_mfpt_ros.report.gallery import drawing
+
+    plan = make_plan(
+        args.controllers,
+        quick=args.quick,
+        walks=args.walks,
+        drawing=drawing() if args.pictures else "",
+    )
     workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
     if workers < 1:
         raise InputError("--workers", workers, "a whole number >= 1")
@@ -54,9 +63,8 @@ def reproduce(args: argparse.Namespace) -> None:
             with Processes(directory / "logs") as processes:
                 compile_all(progress.say)
                 _compute(study, processes, directory, workers)
-        seconds = {"computing": time.monotonic() - start}
-        report = _write(study, directory, workers, seconds, args, progress)
-    report["seconds"] |= seconds
+        progress.show("writing the report")
+        report = _write(study, directory, workers, start)
     print(json_text(report) if args.json else _text(report, directory))
 
 
@@ -149,12 +157,44 @@ def _compute(study: _Study, processes: Processes, directory: Path, workers: int)
             _timed(study, job, partial(work.tolerance, job, state, workers, study.count(job)))
         elif job.kind == "slopes":
             _timed(study, job, partial(work.slopes, job, state))
+        elif job.kind == "pictures":
+            _timed(study, job, partial(_pictures, study, job, state, directory))
 
 
 def _timed(study: _Study, job: Job, do: Callable[[], dict[str, Any]]) -> None:
     start = time.monotonic()
     result = do()
     study.finish(job, result, time.monotonic() - start)
+
+
+def _pictures(study: _Study, job: Job, state: list[float], directory: Path) -> dict[str, Any]:
+    """Draw a controller's gait, and its mesh as the bag has it."""
+    from biped_mfpt_ros.bag import read_meshes
+    from biped_mfpt_ros.report.gallery import gallery
+
+    mesh = None
+    result = study.results.get(study.plan.of("mesh", job.controller)[-1].name)
+    if result is not None:
+        mesh = read_meshes(directory / result["bag"])[result["mesh_id"]].mesh
+    pictures = gallery(
+        controller(job.controller),
+        readings()[job.controller].model,
+        state,
+        job.settings["sigma_deg"],
+        mesh,
+        animated=job.settings["animated"],
+    )
+    return {
+        "pictures": [
+            {
+                "title": picture.title,
+                "caption": picture.caption,
+                "mime": picture.mime,
+                "data": base64.b64encode(picture.data).decode(),
+            }
+            for picture in pictures
+        ]
+    }
 
 
 @dataclass
@@ -289,22 +329,35 @@ def _close(study: _Study, processes: Processes, recording: _Recording | None) ->
 # The report -------------------------------------------------------------------------------------
 
 
-def _write(
-    study: _Study,
-    directory: Path,
-    workers: int,
-    seconds: dict[str, float],
-    args: argparse.Namespace,
-    progress: Progress,
-) -> dict[str, Any]:
+def _write(study: _Study, directory: Path, workers: int, start: float) -> dict[str, Any]:
     """Write HTML, JSON and CSV; return what is in the JSON."""
     from biped_mfpt_ros.report import html
 
-    progress.show("writing the report")
-    start = time.monotonic()
+    began = time.monotonic()
     results = Results(study.plan, study.results)
     found, lines = tables(results), curves(results)
-    report: dict[str, Any] = {
+    files = {f"{t.name}.csv": t.csv() for t in found}
+    for number, scheme in ((2, "hzd"), (3, "smc")):
+        rows = [
+            f"{curve.controller},{at!r},{mfpt!r}"
+            for curve in lines
+            if scheme_of(curve.controller) == scheme
+            for at, mfpt in zip(curve.sigma_deg, curve.mfpt, strict=True)
+        ]
+        if rows:
+            files[f"figure{number}.csv"] = "\n".join(["controller,sigma_s_deg,mfpt", *rows, ""])
+    pictures = {
+        job.controller: [
+            Picture(p["title"], p["caption"], base64.b64decode(p["data"]), p["mime"])
+            for p in study.results[job.name]["pictures"]
+        ]
+        for job in study.plan.of("pictures")
+        if job.name in study.results
+    }
+    files["report.html"] = html.page(results, found, lines, pictures, study.seconds)
+    study.seconds["report"] = time.monotonic() - began
+    study.seconds["all"] = time.monotonic() - start
+    report = {
         "controllers": study.plan.controllers,
         "quick": study.plan.quick,
         "walks": study.plan.walks,
@@ -312,43 +365,19 @@ def _write(
         "step_map": STEP_MAP,
         "tables": {t.name: t.to_dict() for t in found},
         "curves": [vars(curve) for curve in lines],
-        "results": {
-            job.name: {"kind": job.kind, "controller": job.controller}
-            | {"settings": job.settings, "result": study.results[job.name]}
+        "results": [
+            job.inputs | {"result": study.results[job.name]}
             for job in study.plan.jobs
-            if job.name in study.results
-        },
+            if job.name in study.results and job.kind != "pictures"
+        ],
+        "seconds": study.seconds,
     }
-    for t in found:
-        (directory / f"{t.name}.csv").write_text(t.csv())
-    for number, scheme in ((2, "hzd"), (3, "smc")):
-        rows = ["controller,sigma_s_deg,mfpt"]
-        for curve in lines:
-            if scheme_of(curve.controller) == scheme:
-                points = zip(curve.sigma_deg, curve.mfpt, strict=True)
-                rows += [f"{curve.controller},{at!r},{mfpt!r}" for at, mfpt in points]
-        if len(rows) > 1:
-            (directory / f"figure{number}.csv").write_text("\n".join(rows) + "\n")
-    pictures: dict[str, list[Any]] = {}
-    if args.pictures:
-        pictures = _pictures(study, directory, progress)
-    seconds["drawing"] = time.monotonic() - start
-    report["seconds"] = {**study.seconds, **seconds}
-    page = html.page(results, found, lines, pictures, report["seconds"])
-    _replace(directory / "report.html", page)
-    _replace(directory / "report.json", json_text(report) + "\n")
+    files["report.json"] = json_text(report) + "\n"
+    for name, text in files.items():
+        beside = directory / f".{name}.tmp"
+        beside.write_text(text)
+        beside.replace(directory / name)
     return report
-
-
-def _replace(path: Path, text: str) -> None:
-    beside = path.with_suffix(path.suffix + ".tmp")
-    beside.write_text(text)
-    beside.replace(path)
-
-
-def _pictures(study: _Study, directory: Path, progress: Progress) -> dict[str, list[Any]]:
-    """Pictures of each controller's gait and mesh, `report.style.Picture`, by its name."""
-    return {}
 
 
 def _text(report: dict[str, Any], directory: Path) -> str:

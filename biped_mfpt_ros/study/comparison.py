@@ -219,9 +219,7 @@ def _parameters_hzd(names: Sequence[str]) -> Table:
         for joint in range(4):
             for k in range(DEGREE + 1):
                 again = float(start[k][joint]) if k < 2 else None
-                rows.append(
-                    _parameter(name, f"α_{k}^{joint + 1}", bezier[joint, k], again)
-                )
+                rows.append(_parameter(name, f"α_{k}^{joint + 1}", bezier[joint, k], again))
     return Table(
         "table1",
         "Table 1: parameters of the first scheme",
@@ -644,9 +642,7 @@ def _chain_row(results: Results, n: str, sigma: float) -> dict[str, Any]:
     by = "Monte Carlo" if walked else "finest mesh"
     theirs = paper.mfpt(n, 0.0, sigma)
     coarse = mfpt_of(results.paper_mesh(n), sigma)
-    row = _judged(
-        f"{n}: chain at {sigma:g}°", theirs, ours, by, _CHAIN_WITHIN[scheme_of(n)], ""
-    )
+    row = _judged(f"{n}: chain at {sigma:g}°", theirs, ours, by, _CHAIN_WITHIN[scheme_of(n)], "")
     if row["verdict"] == DIFFERS:
         spread = percent(coarse, ours)
         if spread is not None and abs(spread) > _CHAIN_WITHIN[scheme_of(n)]:

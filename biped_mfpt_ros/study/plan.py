@@ -17,7 +17,7 @@ from biped_mfpt_ros.study.readings import readings
 
 SEED = 1
 WALKS = 10_000
-QUICK_WALKS = 1000
+QUICK_WALKS = 500
 SIGMA_DEG = {"hzd": (1.0, 2.0), "smc": (1.0, 2.0, 5.0)}
 """Standard deviations of the slope (degrees) at which every mesh is evaluated, by scheme."""
 
@@ -63,6 +63,12 @@ _WALKS = {
 _WALK_TOLERANCE = {"hzd": 3e-9, "smc": 1e-7}
 _TOLERANCES = (1e-6, 1e-7, 3e-9, 1e-10)
 
+# Standard deviation (degrees) of the ground in the pictures: for walks of some steps.
+_PICTURE_DEG = {
+    "hzd/base": 1.0, "hzd/cot": 1.0, "hzd/mfpt": 2.0,
+    "smc/base": 5.0, "smc/cot": 1.0, "smc/mfpt": 5.0,
+}  # fmt: skip
+
 # s on one core, of a swing, for the time left.
 _SWING = {"hzd": 0.0004, "smc": 0.0022}
 # Steps of a walk or states of a mesh, roughly, for the same purpose.
@@ -81,7 +87,7 @@ class Job:
     Attributes
     ----------
     kind : str
-        ``cycle``, ``mesh``, ``walks``, ``tolerance`` or ``slopes``.
+        ``cycle``, ``mesh``, ``walks``, ``tolerance``, ``slopes`` or ``pictures``.
     controller : str
         What walks.
     settings : dict
@@ -158,7 +164,11 @@ def scheme_of(name: str) -> str:
 
 
 def make_plan(
-    controllers: Sequence[str] | None = None, *, quick: bool = False, walks: int | None = None
+    controllers: Sequence[str] | None = None,
+    *,
+    quick: bool = False,
+    walks: int | None = None,
+    drawing: str = "",
 ) -> Plan:
     """Plan a study.
 
@@ -169,7 +179,9 @@ def make_plan(
     quick : bool, optional
         Coarser meshes and fewer walks.
     walks : int, optional
-        Walks of Tables 2 and 4; 10000 by default, 1000 if quick.
+        Walks of Tables 2 and 4; 10000 by default, 500 if quick.
+    drawing : str, optional
+        Identity of what draws the pictures; none are drawn without.
 
     Raises
     ------
@@ -204,7 +216,7 @@ def make_plan(
     for name in names:
         scheme = scheme_of(name)
         for sigma, share in _WALKS[name].items():
-            if quick and sigma != TABLE_SIGMA_DEG[scheme]:
+            if quick and (name, sigma) == ("smc/base", 2.0):
                 continue
             number = max(2, round(share * walks))
             jobs.append(
@@ -236,4 +248,8 @@ def make_plan(
             )
     if "hzd/base" in names:
         jobs.append(Job("slopes", "hzd/base", {"steps": 50}, 1.0))
+    if drawing:
+        for name in names:
+            about = {"sigma_deg": _PICTURE_DEG[name], "animated": not quick, "drawing": drawing}
+            jobs.append(Job("pictures", name, about, 2.5 if quick else 5.0))
     return Plan(names, quick, walks, tuple(jobs))

@@ -28,9 +28,7 @@ _MOST_STEPS = 20_000  # of a walk
 def cycle(job: Job) -> dict[str, Any]:
     """Limit cycle on flat ground, or why there is none."""
     try:
-        found = find_limit_cycle(
-            controller(job.controller), 0.0, readings()[job.controller].model
-        )
+        found = find_limit_cycle(controller(job.controller), 0.0, readings()[job.controller].model)
     except NoLimitCycle as error:
         return {"found": False, "reason": str(error)}
     return {
