@@ -28,7 +28,7 @@ def mesh(args: argparse.Namespace) -> None:
     """Mesh a controller's reachable states."""
     if args.output is not None and Path(args.output).exists():
         raise InputError("--output", args.output, "a file that does not exist yet")
-    grown, result = _grow(args)
+    grown, result = grow(args)
     if args.output is not None:
         # Under the name that was given: numpy would add an ending to a name.
         with open(args.output, "xb") as file:
@@ -53,7 +53,7 @@ def mfpt(args: argparse.Namespace) -> None:
 
     mean = options.mean_of(args)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
-    grown, result = _grow(args)
+    grown, result = grow(args)
     start = time.perf_counter()
     estimates = []
     for sigma, sigma_deg in zip(sigmas, args.sigma, strict=True):
@@ -74,7 +74,7 @@ def mfpt(args: argparse.Namespace) -> None:
     print(mfpt_table(estimates))
 
 
-def _grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:
+def grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:
     """Grow the mesh that the options ask for; also what describes it, for JSON."""
     controller, model = options.controller_of(args), options.model_of(args)
     slopes = options.slopes_of(args)
