@@ -190,18 +190,15 @@ def _step_backward(targets, probabilities, x, out):
 
 
 @kernel
-def _settle(x, out, stay, floor):
-    """Write out[1:] + stay * x[1:], scaled to sum 1, to x; return the largest relative change.
+def _settle(x, out, total, stay, floor):
+    """Replace x, of sum 1, by out + stay * x, scaled to sum 1; return the largest relative change.
 
-    Components that shrink and are below `floor` do not count.
+    `total` is the sum of `out`; index 0 does not count in either, nor do components that shrink
+    and are below `floor`.
     """
-    total = 0.0
-    for i in range(1, x.shape[0]):
-        out[i] += stay * x[i]
-        total += out[i]
     largest = 0.0
     for i in range(1, x.shape[0]):
-        value = out[i] / total
+        value = (out[i] + stay * x[i]) / (total + stay)
         change = value - x[i]
         if value > _UNDERFLOW and (change > 0.0 or value > floor):
             largest = max(largest, abs(change) / value)
@@ -413,11 +410,12 @@ def _iterate(
     previous = math.inf
     for k in range(1, _STEPS + 1):
         step(targets, probabilities, x, out)
+        # Summed in pairs by NumPy: rounding that differs from step to step would look like change.
         total = float(out[1:].sum())
         if total == 0.0:
             return x
         stay = 0.0 if k <= _PLAIN_STEPS else 0.5 * total
-        change = _settle(x, out, stay, floor(out, total))
+        change = _settle(x, out, total, stay, floor(out, total))
         # Two in a row, as parts that oscillate may stand still for a moment.
         if k * max(change, previous) <= tolerance:
             return x

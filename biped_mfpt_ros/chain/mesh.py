@@ -42,8 +42,9 @@ NOT_SIMULATED = 255
 DEFAULT_MAX_STATES = 100_000
 """Default limit on the states of a mesh."""
 
-# Relative to the largest value of a dimension. Rounding in a step leaves some 1e-16 to 1e-14, and
-# the step map is good to 1e-6 or so: nothing that is still to be told apart lies below.
+# Relative to the largest value of a dimension, or to 1 rad or rad/s, as small values may come from
+# the difference of large ones. Rounding in a step leaves some 1e-16 to 1e-14, and the step map is
+# good to 1e-6 or so: nothing that is still to be told apart lies below.
 _ROUNDING = 1e-12
 
 
@@ -259,7 +260,7 @@ def _spread(states: np.ndarray) -> np.ndarray:
     # Taken from the first state, a constant dimension is exactly 0 and a narrow one loses nothing.
     deviation = np.std(states - states[0], axis=0)
     largest = np.maximum(states.max(axis=0), -states.min(axis=0))
-    return np.where(deviation > _ROUNDING * largest, deviation, 0.0)
+    return np.where(deviation > _ROUNDING * np.maximum(largest, 1.0), deviation, 0.0)
 
 
 def _scales(states: np.ndarray, successors: np.ndarray) -> np.ndarray:

@@ -25,23 +25,18 @@ _UNSORTED_SHARE = 1.0 / 32.0
 
 
 @kernel
-def _distance(a, b, weights, limit):
-    """Eq. (25) between two states, or some number above the limit if it is above the limit.
-
-    Sums of squares only grow, so one that is already above the limit is cut short.
-    """
+def _distance(candidates, position, states, index, weights):
+    """Eq. (25) between two rows. Ending the sum early would cost more in branches than it saves."""
     distance = 0.0
     for d in range(STATE_SIZE):
-        standardised = (a[d] - b[d]) * weights[d]
+        standardised = (candidates[position, d] - states[index, d]) * weights[d]
         distance += standardised * standardised
-        if distance > limit:
-            break
     return distance
 
 
 @kernel
 def _nearest_within(
-    candidate, cluster, weights, limit, any_will_do,
+    candidates, position, cluster, weights, limit, any_will_do,
     states, order, rows, starts, axes, earlier, newest,
 ):  # fmt: skip
     """Index of the nearest state of the cluster within `limit`, the lowest of several; 0: none.
@@ -56,7 +51,7 @@ def _nearest_within(
     found = 0
     index = newest[cluster]
     while index != 0:
-        distance = _distance(candidate, states[index], weights, best)
+        distance = _distance(candidates, position, states, index, weights)
         # From high indices to low ones: "not above" lets the lowest index win a tie.
         if distance <= best:
             best = distance
@@ -66,41 +61,37 @@ def _nearest_within(
         index = earlier[index]
 
     axis = axes[cluster]
+    value = candidates[position, axis]
+    weight = weights[axis]
     begin = starts[cluster]
     end = starts[cluster + 1]
     low = begin
     high = end
     while low < high:
         middle = (low + high) // 2
-        if rows[middle, axis] < candidate[axis]:
+        if rows[middle, axis] < value:
             low = middle + 1
         else:
             high = middle
     down = low - 1
     up = low
-    gap_down = np.inf
-    gap_up = np.inf
-    if down >= begin:
-        gap_down = ((candidate[axis] - rows[down, axis]) * weights[axis]) ** 2
-    if up < end:
-        gap_up = ((candidate[axis] - rows[up, axis]) * weights[axis]) ** 2
-    # One term of the sum of squares is never above the sum, in floating point too.
-    while down >= begin or up < end:
+    while True:
+        gap_down = np.inf
+        gap_up = np.inf
+        if down >= begin:
+            gap_down = ((value - rows[down, axis]) * weight) ** 2
+        if up < end:
+            gap_up = ((value - rows[up, axis]) * weight) ** 2
+        # One term of the sum of squares is never above the sum, in floating point too.
+        if min(gap_down, gap_up) > best or (down < begin and up >= end):
+            break
         if up >= end or (down >= begin and gap_down <= gap_up):
-            if gap_down > best:
-                break
             row = down
             down -= 1
-            if down >= begin:
-                gap_down = ((candidate[axis] - rows[down, axis]) * weights[axis]) ** 2
         else:
-            if gap_up > best:
-                break
             row = up
             up += 1
-            if up < end:
-                gap_up = ((candidate[axis] - rows[up, axis]) * weights[axis]) ** 2
-        distance = _distance(candidate, rows[row], weights, best)
+        distance = _distance(candidates, position, rows, row, weights)
         if distance < best or (distance == best and (found == 0 or order[row] < found)):
             best = distance
             found = order[row]
@@ -122,7 +113,7 @@ def _extend(
     for position in range(start, candidates.shape[0]):
         cluster = clusters[position]
         if _nearest_within(
-            candidates[position], cluster, weights, threshold, True,
+            candidates, position, cluster, weights, threshold, True,
             states, order, rows, starts, axes, earlier, newest,
         ) != 0:  # fmt: skip
             continue
@@ -145,7 +136,7 @@ def _nearest(
 ):
     for position in range(candidates.shape[0]):
         out[position] = _nearest_within(
-            candidates[position], clusters[position], weights, np.inf, False,
+            candidates, position, clusters[position], weights, np.inf, False,
             states, order, rows, starts, axes, earlier, newest,
         )  # fmt: skip
 
@@ -203,8 +194,8 @@ class StateSet:
             self.states,
             self._of_cluster,
             weights,
-            np.zeros((clusters, STATE_SIZE)),
-            np.zeros((clusters, STATE_SIZE)),
+            np.full((clusters, STATE_SIZE), np.inf),
+            np.full((clusters, STATE_SIZE), -np.inf),
             self._axes,
         )
         of_cluster = self._of_cluster[1:count]
