@@ -37,6 +37,10 @@ class Peers:
     recorder: bool
 
 
+class AnalysisFailed(CommandError):
+    """The analysis could not tell an MFPT; the message says why."""
+
+
 class Client:
     """Client of a pipeline in one namespace. Use it as a context manager.
 
@@ -89,7 +93,19 @@ class Client:
             simulators=len(simulators),
             mesher=self._grow.server_is_ready(),
             analysis=self._compute.service_is_ready(),
-            recorder=any(info.node_name == "recorder" for info in recorders),
+            recorder=any(info.node_name.startswith("recorder") for info in recorders),
+        )
+
+    def listens(self, node: str, topics: Sequence[str]) -> bool:
+        """Whether a node of the pipeline is subscribed to all of some topics."""
+        return all(
+            any(
+                info.node_name == node
+                for info in self._node.get_subscriptions_info_by_topic(
+                    self._node.resolve_topic_name(topic)
+                )
+            )
+            for topic in topics
         )
 
     def wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
@@ -149,13 +165,13 @@ class Client:
     def compute_mfpt(
         self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]
     ) -> list[MfptEstimate]:
-        """Ask the analysis for the MFPT of a mesh at any ``sigma_s``."""
+        """Ask the analysis for the MFPT of a mesh at any ``sigma_s``; it may raise AnalysisFailed."""
         request = ComputeMfpt.Request(
             mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array(sigma_s), "d")
         )
         response = self._result(self._compute.call_async(request))
         if not response.success:
-            raise CommandError(f"the analysis failed: {response.message}")
+            raise AnalysisFailed(f"the analysis failed: {response.message}")
         return list(response.estimates)
 
     def _result(self, future: Future) -> Any:

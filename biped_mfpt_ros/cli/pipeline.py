@@ -171,6 +171,8 @@ class Pipeline:
         # The log's topic is the same for all nodes on the graph, if it is not brought in here.
         command += ["--ros-args", "-r", f"__ns:={self._namespace}", "-r", "/rosout:=rosout"]
         command += ["--disable-external-lib-logs"]
+        if last:  # there may be several recorders, which must be told apart
+            command += ["-r", f"__node:={name}"]
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         environment = os.environ | {"RCUTILS_COLORIZED_OUTPUT": "0", "PYTHONUNBUFFERED": "1"}

@@ -36,7 +36,8 @@ from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.terrain import slope_set
 
 _MOST_STATES = 200_000
-_POLL = 0.05  # s
+_RETRY = 0.05  # s
+_RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
 
 
 def reproduce(args: argparse.Namespace) -> None:
@@ -234,11 +235,14 @@ def _meshes(
             recorder = pipeline.record(name, bag, earlier=False)
             # The bag of the mesh before is closed and checked while this recorder starts.
             _close(study, processes, last)
-            client.wait(partial(pipeline.up, client), START_TIMEOUT, "the nodes to come up")
             if not i:
+                client.wait(partial(pipeline.up, client), START_TIMEOUT, "the nodes to come up")
                 study.seconds["starting nodes"] = time.monotonic() - started
-                start = time.monotonic()
-            result = _grow(study, job, client, published)
+            study.show(job, "starting its recorder")
+            client.wait(
+                partial(client.listens, name, _RECORDED), START_TIMEOUT, f"{name} to come up"
+            )
+            result = _grow(study, job, client)
             processes.end(recorder)
             last = _Recording(
                 job, result | {"bag": str(bag.relative_to(directory))}, recorder, bag,
@@ -250,7 +254,7 @@ def _meshes(
     processes.stop()
 
 
-def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[str, Any]:
+def _grow(study: _Study, job: Job, client: Any) -> dict[str, Any]:
     """Grow a mesh, and have the analysis compute its MFPT."""
     from biped_mfpt_ros.nodes.messages import MeshSettings
 
@@ -276,13 +280,7 @@ def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[
 
     study.show(job)
     grown = client.grow_mesh(settings, feedback)
-    study.show(job, "waiting for the analysis")
-    radians = {deg: options.spread("sigma", deg) for deg in published}
-    client.published_mfpt(grown.mesh_id, 0.0, list(radians.values()), RESULT_TIMEOUT)
-    sigma_deg = job.settings["sigma_deg"]
-    estimates = client.compute_mfpt(
-        grown.mesh_id, 0.0, [options.spread("sigma", deg) for deg in sigma_deg]
-    )
+    estimates = _estimates(study, job, client, grown.mesh_id)
     return {
         "mesh_id": grown.mesh_id,
         "states": grown.states,
@@ -291,10 +289,11 @@ def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[
         "swings_per_second": grown.swings / grown.seconds,
         "seconds": grown.seconds,
         "step_map_seconds": grown.step_map_seconds,
-        "mfpt": [estimate.mfpt for estimate in estimates],
-        "failure_probability": [estimate.failure_probability for estimate in estimates],
+        "mfpt": [e and e.mfpt for e in estimates],
+        "failure_probability": [e and e.failure_probability for e in estimates],
         "failure_shares": [
-            {
+            e
+            and {
                 Outcome(code).name.lower(): share
                 for code, share in zip(e.failure_codes, e.failure_shares, strict=True)
                 if share > 0.0
@@ -302,6 +301,30 @@ def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[
             for e in estimates
         ],
     }
+
+
+def _estimates(study: _Study, job: Job, client: Any, mesh_id: str) -> list[Any]:
+    """MFPT at every sigma of a mesh; None where the chain could not be solved."""
+    from biped_mfpt_ros.cli.client import AnalysisFailed
+
+    deadline = time.monotonic() + RESULT_TIMEOUT
+    out = []
+    for done, sigma_deg in enumerate(job.settings["sigma_deg"]):
+        study.show(job, f"MFPT at {done} of {len(job.settings['sigma_deg'])} sigmas")
+        while True:
+            try:
+                sigma = options.spread("sigma", sigma_deg)
+                out.append(client.compute_mfpt(mesh_id, 0.0, [sigma])[0])
+                break
+            except AnalysisFailed as error:
+                # The last messages of the mesh may still be on their way to the analysis.
+                if "mesh_id" in str(error) and time.monotonic() < deadline:
+                    time.sleep(_RETRY)
+                    continue
+                study.progress.say(f"{job.title}: no MFPT at {sigma_deg:g} degrees: {error}")
+                out.append(None)
+                break
+    return out
 
 
 def _close(study: _Study, processes: Processes, recording: _Recording | None) -> None:

@@ -124,6 +124,7 @@ def convergence(name: str, results: Results) -> Picture:
                 axes.axhline(value, color=PAPER, linewidth=1.2, linestyle=style, label=label)
                 values.append(value)
         axes.set_xscale("log")
+        _few_ticks(axes, [mesh["states"] for mesh in meshes])
         wide = max(values, default=1.0) > 20.0 * min(values, default=1.0)
         if wide:
             _steps_axis(axes)
@@ -150,6 +151,19 @@ def convergence(name: str, results: Results) -> Picture:
         "red is the paper's.",
         png(figure),
     )
+
+
+def _few_ticks(axes: Axes, counts: Sequence[int]) -> None:
+    """Put some round numbers on a logarithmic axis of counts, also on one below a decade."""
+    low, high = 0.8 * min(counts), 1.25 * max(counts)
+    tens = [10.0**k for k in range(8)]
+    for factors in ((1,), (1, 3), (1, 2, 5)):
+        ticks = [f * ten for ten in tens for f in factors if low <= f * ten <= high]
+        if len(ticks) >= 2:
+            break
+    axes.set_xlim(low, high)
+    axes.set_xticks(ticks, [f"{tick / 1000:g}k" if tick >= 1000 else f"{tick:g}" for tick in ticks])
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _steps_axis(axes: Axes) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -56,7 +57,9 @@ nav a { text-decoration: none; font-size: .93rem; }
 .scroll { overflow-x: auto; margin: .7rem 0 .4rem; border: 1px solid var(--line); border-radius: .5rem; }
 table { border-collapse: collapse; width: 100%; font-size: .88rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; padding: .5rem .7rem; font-weight: 600; }
-th { background: var(--wash); text-align: left; font-weight: 600; vertical-align: bottom; color: var(--soft); }
+th { background: var(--wash); text-align: left; font-weight: 600; vertical-align: bottom; color: var(--soft);
+  min-width: 5.2rem; }
+sub, sup { font-size: .75em; line-height: 0; }
 th, td { padding: .38rem .7rem; border-bottom: 1px solid var(--line); }
 td { white-space: nowrap; vertical-align: top; }
 td.long { white-space: normal; min-width: 15rem; }
@@ -154,9 +157,9 @@ def page(
             )  # fmt: skip
     add("times", "How it was computed", _computed(results, seconds))
 
-    contents = "".join(f'<li><a href="#{a}">{escape(title)}</a></li>' for a, title, _ in sections)
+    contents = "".join(f'<li><a href="#{a}">{_text(title)}</a></li>' for a, title, _ in sections)
     body = "\n".join(
-        f'<section id="{anchor}"><h2>{escape(title)}</h2>\n{text}</section>'
+        f'<section id="{anchor}"><h2>{_text(title)}</h2>\n{text}</section>'
         for anchor, title, text in sections
     )
     quick = (
@@ -177,8 +180,8 @@ def page(
 <h1>How many steps until it falls?</h1>
 <p>The tables and figures of Saglam and Byl, <i>Quantifying and Optimizing Robustness of Bipedal
 Walking Gaits on Rough Terrain</i>, computed again, with every number beside the paper's. MFPT is
-the mean first-passage time to a fall, in steps; σ_s the standard deviation of the slope that each
-step meets, with mean 0.</p>{quick}
+the mean first-passage time to a fall, in steps; σ<sub>s</sub> the standard deviation of the slope
+that each step meets, with mean 0.</p>{quick}
 </div></header>
 <nav><div class="page"><ul>{contents}</ul></div></nav>
 <main class="page">
@@ -193,10 +196,10 @@ report.json and in a .csv file for each table and figure; every mesh is in a bag
 
 
 _CONVERGENCE = """<p>The MFPT of a mesh is that of the walker only when the mesh is fine enough:
-d_thr, the distance from which on a state is a new one, and d_s, the spacing of the slopes, are made
-smaller until it settles. Where walks are short enough, Monte Carlo is the judge: its walks meet any
-slope, not only those of the set, and no state is replaced by a near one. What remains of the
-difference on the finest mesh is the spacing of the slopes.</p>"""
+d<sub>thr</sub>, the distance from which on a state is a new one, and d<sub>s</sub>, the spacing of
+the slopes, are made smaller until it settles. Where walks are short enough, Monte Carlo is the
+judge: its walks meet any slope, not only those of the set, and no state is replaced by a near one.
+What remains of the difference on the finest mesh is the spacing of the slopes.</p>"""
 
 
 def _tiles(results: Results, by: Mapping[str, Table]) -> str:
@@ -256,7 +259,7 @@ def _table(table: Table) -> str:
     """A table; columns without any cell are left out."""
     columns = [c for c in table.columns if any(r.get(c.key) is not None for r in table.rows)]
     head = "".join(
-        f"<th{_class(c)} scope=col>{escape(c.heading)}</th>" for c in columns
+        f"<th{_class(c)} scope=col>{_text(c.heading)}</th>" for c in columns
     )  # fmt: skip
     body, before = [], None
     for row in table.rows:
@@ -265,8 +268,8 @@ def _table(table: Table) -> str:
         first = before is not None and group != before
         body.append(f"<tr{' class=first' if first else ''}>{cells}</tr>")
         before = group
-    caption = f"<caption>{escape(table.title)}</caption>" if table.title else ""
-    notes = "".join(f'<p class="note">{escape(note)}</p>' for note in table.notes)
+    caption = f"<caption>{_text(table.title)}</caption>" if table.title else ""
+    notes = "".join(f'<p class="note">{_text(note)}</p>' for note in table.notes)
     return (
         f'<div class="scroll"><table>{caption}<thead><tr>{head}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>{notes}"
@@ -283,7 +286,7 @@ def _cell(value: Any, column: Column) -> str:
         return f'<td><span class="badge{kind}">{escape(str(value))}</span></td>'
     if column.kind == TEXT:
         text = "" if value is None else str(value)
-        return f"<td{' class=long' if len(text) > 45 else ''}>{escape(text)}</td>"
+        return f"<td{' class=long' if len(text) > 45 else ''}>{_text(text)}</td>"
     kind = "n ours" if column.key == "here" else "n"
     return f'<td class="{kind}">{_value(value, column.kind)}</td>'
 
@@ -314,17 +317,23 @@ def _value(value: Any, kind: str) -> str:
     return text.replace("-", "−")
 
 
+def _text(text: str) -> str:
+    """Text with its symbols' indices set as such."""
+    found = re.sub(r"\b(σ|d|α|K)_(s|thr|[0-6PD])(?![a-z])", r"\1<sub>\2</sub>", escape(text))
+    return re.sub(r"(?<=</sub>)\^(\d)", r"<sup>\1</sup>", found)
+
+
 def _figure(picture: Picture, titled: bool = True) -> str:
     data = base64.b64encode(picture.data).decode()
-    title = f"<b>{escape(picture.title)}.</b> " if titled else ""
+    title = f"<b>{_text(picture.title)}.</b> " if titled else ""
     return (
         f'<figure><img alt="{escape(picture.title)}" src="data:{picture.mime};base64,{data}">'
-        f"<figcaption>{title}{escape(picture.caption)}</figcaption></figure>"
+        f"<figcaption>{title}{_text(picture.caption)}</figcaption></figure>"
     )
 
 
 def _folded(summary: str, text: str) -> str:
-    return f"<details><summary>{escape(summary)}</summary>{text}</details>" if text else ""
+    return f"<details><summary>{_text(summary)}</summary>{text}</details>" if text else ""
 
 
 def _computed(results: Results, seconds: Mapping[str, float]) -> str:

@@ -177,7 +177,7 @@ def mfpt_of(mesh: dict[str, Any] | None, sigma_deg: float) -> float | None:
         return None
     for at, value in zip(mesh["sigma_deg"], mesh["mfpt"], strict=True):
         if at == sigma_deg:
-            return float(value)
+            return None if value is None else float(value)
     return None
 
 
@@ -607,14 +607,14 @@ def _merit(results: Results) -> Table:
         "What of the paper holds",
         (
             Column("number", "the paper's number", TEXT),
+            Column("verdict", "verdict", TEXT),
             Column("paper", "paper"),
             Column("here", "here"),
-            Column("by", "by", TEXT),
             Column("difference", "difference", DIFFERENCE),
-            Column("verdict", "verdict", TEXT),
+            Column("by", "by", TEXT),
             Column("why", "why", TEXT),
         ),
-        [row for row in rows if row["here"] is not None or row["verdict"] == UNKNOWN],
+        rows,
         (
             "A number holds within 5 % (first scheme, Monte Carlo), 10 % (first scheme, chain) or "
             "25 % (second scheme). A chain estimate is judged by Monte Carlo here where its walks "

@@ -25,8 +25,8 @@ TABLE_SIGMA_DEG = {"hzd": 2.0, "smc": 5.0}
 """That of Tables 2 and 4."""
 
 CURVE_DEG = {
-    "hzd": tuple(np.round(np.arange(0.2, 3.01, 0.05), 3).tolist()),
-    "smc": tuple(np.round(np.arange(0.4, 7.01, 0.1), 3).tolist()),
+    "hzd": tuple(np.round([*np.arange(0.2, 1.51, 0.05), *np.arange(1.6, 3.01, 0.2)], 3).tolist()),
+    "smc": tuple(np.round([*np.arange(0.5, 3.51, 0.125), *np.arange(4.0, 7.01, 0.5)], 3).tolist()),
 }
 """Standard deviations (degrees) of Figures 2 and 3."""
 
