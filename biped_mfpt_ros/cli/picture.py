@@ -26,6 +26,8 @@ def picture(args: argparse.Namespace) -> None:
         raise InputError("--output", args.output, f"a file that ends in {ending}")
     if output.exists():
         raise InputError("--output", args.output, "a file that does not exist yet")
+    if not output.parent.is_dir():
+        raise InputError("--output", args.output, "a file in a directory that exists")
     made = _of_mesh(args) if args.kind in _OF_MESHES else _of_walk(args)
     made.save(output)
     if not args.json:

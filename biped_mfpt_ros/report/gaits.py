@@ -467,6 +467,8 @@ def torques(swings: Mapping[str, Trace], model: WalkerModel, name: str) -> Pictu
         if model.friction >= _NO_SLIP
         else f" The stance foot slips where the ratio of forces exceeds {model.friction:g}."
     )
+    if slip and model.slip_duration > 0.0:
+        slip += f" Slips shorter than {1000.0 * model.slip_duration:g} ms are no falls."
     return Picture(
         f"Torques and ground forces of {name}",
         f"Joint torques of {name} and the ratio of tangential to normal ground force: "

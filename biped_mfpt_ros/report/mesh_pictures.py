@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.patches import Patch
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from biped_mfpt_ros.chain.markov import Metastability, slope_probabilities
 from biped_mfpt_ros.chain.mesh import Mesh
@@ -32,7 +32,7 @@ from biped_mfpt_ros.walker.outcome import Outcome
 
 _FALLS = tuple(Outcome)[1:]
 _LEAST_WEIGHT = 1e-12  # of a state that gets a colour; fainter ones are grey
-_LEAST_CHANCE = 1e-6  # lowest chance of falling that is told apart, where some are higher
+_PERCENT = FuncFormatter(lambda value, _: f"{100.0 * value:g}%")
 _NAMES = [f"{symbol}_{i}" for symbol in ("q", r"\dot q") for i in range(1, 6)]
 _WEIGHTS = LinearSegmentedColormap.from_list(
     "weights", colormaps["plasma"](np.linspace(0.92, 0.0, 32))
@@ -274,20 +274,22 @@ def where_it_falls(
     possible = fall > 0.0
     top.stairs(np.where(possible, fall, np.nan), edges, color=BODY, linewidth=1.6, baseline=None)
     top.set_yscale("log")
+    # One power of ten at least, and where falls are very rare not more than twenty.
     least = fall[possible].min() if possible.any() else 1.0
-    top.set_ylim(max(0.5 * least, min(_LEAST_CHANCE, 0.5 * fall.max(initial=1.0))), 1.6)
+    top.set_ylim(np.clip(0.5 * least, 1e-20, 0.07), 1.6)
+    top.yaxis.set_minor_formatter(NullFormatter())
     top.set_ylabel("chance")
     top.set_title("chance of a fall on the slope ahead", fontsize=10, loc="left")
     _stack(middle, edges, ways)
     middle.set_ylim(0.0, 1.0)
-    middle.yaxis.set_major_formatter(PercentFormatter(1.0, 0))
+    middle.yaxis.set_major_formatter(_PERCENT)
     middle.set_ylabel("share of falls\non that slope")
     middle.set_title("how it then falls", fontsize=10, loc="left")
     for axes, values, where in ((ahead, share, "ahead"), (behind, before, "before the step")):
         _stack(axes, edges, values)
         most = values.sum(axis=0).max()
         axes.set_ylim(0.0, 1.08 * most if most > 0.0 else 1.0)
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0, 0 if most > 0.05 else None))
+        axes.yaxis.set_major_formatter(_PERCENT)
         axes.set_ylabel("share of\nall falls")
         axes.set_title(f"all falls over the slope {where}", fontsize=10, loc="left")
     behind.set_xlabel("slope, degrees (negative is downhill)")
