@@ -165,7 +165,7 @@ class Client:
     def compute_mfpt(
         self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]
     ) -> list[MfptEstimate]:
-        """Ask the analysis for the MFPT of a mesh at any ``sigma_s``; it may raise AnalysisFailed."""
+        """Ask the analysis for the MFPT of a mesh at any ``sigma_s``; AnalysisFailed if in vain."""
         request = ComputeMfpt.Request(
             mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array(sigma_s), "d")
         )

@@ -65,7 +65,7 @@ def mfpt_curves(number: int, curves: Sequence[Curve]) -> Picture:
     _steps_axis(axes)
     axes.set_ylim(1.0, 3.0 * largest)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("standard deviation of the slope σ_s, degrees")
+    axes.set_xlabel("standard deviation of the slope $\\sigma_s$, degrees")
     axes.set_ylabel("mean steps to a fall")
     axes.legend(frameon=False, fontsize=9)
     counts = ", ".join(
@@ -132,7 +132,7 @@ def convergence(name: str, results: Results) -> Picture:
             axes.set_ylim(0.0, 1.15 * max(values, default=1.0))
         tidy(axes)
         axes.tick_params(labelsize=8)
-        axes.set_title(f"σ_s = {sigma:g}°", fontsize=10, loc="left")
+        axes.set_title(f"$\\sigma_s$ = {sigma:g}°", fontsize=10, loc="left")
         axes.set_xlabel("states", fontsize=9)
     panels[0].set_ylabel("mean steps to a fall", fontsize=9)
     handles = {
