@@ -312,7 +312,7 @@ def chains(draw):
 
 
 @given(chains())
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=100)
 def test_random_chain_in_high_precision(chain):
     rows, p = chain
     result = solve(rows, p)

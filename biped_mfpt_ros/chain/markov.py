@@ -53,7 +53,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from biped_mfpt_ros.chain.mesh import Mesh, check_transitions, checked_array
 from biped_mfpt_ros.errors import InputError
@@ -131,6 +131,19 @@ def slope_probabilities(slopes: ArrayLike, mu_s: float, sigma_s: float) -> np.nd
     return weights / weights.sum()
 
 
+def _check_chain(targets: ArrayLike, probabilities: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    shape = np.shape(targets)
+    if len(shape) != 2 or shape[0] < 2 or shape[1] < 1:
+        raise InputError("targets", shape, "an array of shape (n, m), n at least 2, m at least 1")
+    targets = checked_array("targets", targets, np.uint32, shape)
+    if targets.max() >= shape[0]:
+        raise InputError("targets", int(targets.max()), f"indices of states, below {shape[0]}")
+    probabilities = checked_array("probabilities", probabilities, np.float64, shape[1:])
+    if not ((probabilities >= 0.0).all() and abs(probabilities.sum() - 1.0) <= 1e-12):
+        raise InputError("probabilities", probabilities.tolist(), "not negative, with sum 1")
+    return targets, probabilities
+
+
 def transition_matrix(targets: ArrayLike, probabilities: ArrayLike) -> csr_array:
     """Stochastic state-transition matrix T (eq. 32), the failure state included as index 0.
 
@@ -145,8 +158,13 @@ def transition_matrix(targets: ArrayLike, probabilities: ArrayLike) -> csr_array
     -------
     scipy.sparse.csr_array
         Shape (n, n), rows sum to 1 within rounding. Transitions of probability 0 are left out.
+
+    Raises
+    ------
+    InputError
+        If an argument is not allowed.
     """
-    targets, probabilities = np.asarray(targets), np.asarray(probabilities)
+    targets, probabilities = _check_chain(targets, probabilities)
     n = len(targets)
     columns = np.flatnonzero(probabilities)
     indices = targets[1:, columns].ravel()
@@ -297,43 +315,36 @@ def _dense_distribution(targets: np.ndarray, probabilities: np.ndarray, start: i
     lambda_2 is the largest of the classes' eigenvalues, and phi the limit of the distribution
     from a state of that class.
     """
-    n = len(targets)
     reached = _mark_reachable(targets, start)
     reached[0] = False
     members = np.flatnonzero(reached)
     _check_size(len(members))
-    # Rows of the members; column 0 is the falls.
-    matrix = transition_matrix(targets, probabilities).toarray()
-    count, labels = connected_components(
-        csr_array(matrix[np.ix_(members, members)] > 0.0), connection="strong"
-    )
-    classes = [members[labels == label] for label in range(count)]
+    rows = transition_matrix(targets, probabilities)[members]
+    matrix, falls = rows[:, members].toarray(), rows[:, [0]].toarray().ravel()
+    graph = csr_array(matrix)
+    count, labels = connected_components(graph, connection="strong")
+    classes = [np.flatnonzero(labels == label) for label in range(count)]
     keys = []
     for states in classes:
-        others = np.ones(n, dtype=np.bool_)
-        others[states] = False
-        leaves = matrix[np.ix_(states, others)].sum(axis=1)
+        leaves = falls[states] + matrix[states][:, labels != labels[states[0]]].sum(axis=1)
         q = matrix[np.ix_(states, states)]
         x = _squared(q, leaves, np.arange(len(states))) if q.any() else np.ones(1)
         # Near 1 the rates no longer tell small eigenvalues apart; what stays does.
         keys.append((float(x @ leaves), -float((x @ q).sum())))
     best = min(range(count), key=keys.__getitem__)
     while True:
-        below = _mark_reachable(targets, int(classes[best][0]))
+        below = np.sort(breadth_first_order(graph, classes[best][0], return_predecessors=False))
         # Of equal classes one behind the other, the last one keeps all the weight.
-        ties = [c for c in range(count) if c != best and keys[c] == keys[best]]
-        behind = [c for c in ties if below[classes[c][0]]]
+        behind = [c for c in set(labels[below]) if c != best and keys[c] == keys[best]]
         if not behind:
             break
         best = behind[0]
-    below[0] = False
-    states = np.flatnonzero(below)
-    q = matrix[np.ix_(states, states)]
     x = np.ones(1)
-    if q.any():
-        x = _squared(q, matrix[states, 0], np.searchsorted(states, classes[best]))
-    out = np.zeros(n)
-    out[states] = x
+    if len(below) > 1 or matrix[below[0], below[0]] > 0.0:
+        among = np.searchsorted(below, classes[best])
+        x = _squared(matrix[np.ix_(below, below)], falls[below], among)
+    out = np.zeros(len(targets))
+    out[members[below]] = x
     return out
 
 
@@ -480,7 +491,7 @@ def _iterated_times(
 
     where phi (1 - psi) = 0, so the series forgets as fast as the chain does and is of the size
     of that time, however large the first term. psi comes from the likeliest state just as phi
-    does from x_2. With `escape` 0 all is in the series, which then has no negative term. It is
+    does. With `escape` 0 all is in the series, which then has no negative term. It is
     also taken where the two parts nearly cancel: states that outlive the metastable ones by far
     but only for a few steps, which needs a small lambda_2.
     """
@@ -684,13 +695,7 @@ def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLik
     ChainError
         If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
-    shape = np.shape(targets)
-    if len(shape) != 2 or shape[0] < 2 or shape[1] < 1:
-        raise InputError("targets", shape, "an array of shape (n, m), n at least 2, m at least 1")
-    targets = checked_array("targets", targets, np.uint32, shape)
-    outcomes = checked_array("outcomes", outcomes, np.uint8, shape)
-    probabilities = checked_array("probabilities", probabilities, np.float64, shape[1:])
+    targets, probabilities = _check_chain(targets, probabilities)
+    outcomes = checked_array("outcomes", outcomes, np.uint8, targets.shape)
     check_transitions(targets, outcomes)
-    if not ((probabilities >= 0.0).all() and abs(probabilities.sum() - 1.0) <= 1e-12):
-        raise InputError("probabilities", probabilities.tolist(), "not negative, with sum 1")
     return _solve(targets, outcomes, probabilities)
