@@ -37,6 +37,7 @@ from biped_mfpt_ros.walker.terrain import slope_set
 
 _MOST_STATES = 200_000
 _RETRY = 0.05  # s
+_PRIOR = 60.0  # s of work after which the pace is believed rather than the plan
 _RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
 
 
@@ -125,11 +126,10 @@ class _Study:
         # What has been done took so much more or less than expected; so will the rest, probably.
         expected = sum(j.seconds for j in ended) + share * job.seconds
         left = sum(j.seconds for j in missing) - share * job.seconds
-        if expected > 5.0:
+        pace = (elapsed + _PRIOR) / (expected + _PRIOR)
+        if ended:
             text += f", {60.0 * len(ended) / elapsed:.3g}/min"
-            text += f", {duration_text(left * elapsed / expected)} left"
-        else:
-            text += f", about {duration_text(left)} left"
+        text += f", about {duration_text(left * pace)} left"
         self.progress.show(f"{text}; {job.title}{': ' if details else ''}{details}")
 
     def count(self, job: Job) -> Callable[[int, int], None]:

@@ -565,12 +565,23 @@ def curves(results: Results) -> list[Curve]:
             walk = results.walks(n, sigma)
             if walk is not None and walk["low"] is not None:
                 walked.append((sigma, *(float(walk[k]) for k in ("mean_steps", "low", "high"))))
+        solved = [
+            (at, float(value))
+            for at, value in zip(mesh["sigma_deg"], mesh["mfpt"], strict=True)
+            if value is not None
+        ]
         out.append(
             Curve(
-                n, mesh["slope_step_deg"], mesh["threshold"], mesh["states"], mesh["sigma_deg"],
-                [float(value) for value in mesh["mfpt"]], theirs, walked,
+                n,
+                mesh["slope_step_deg"],
+                mesh["threshold"],
+                mesh["states"],
+                [at for at, _ in solved],
+                [value for _, value in solved],
+                theirs,
+                walked,
             )
-        )  # fmt: skip
+        )
     return out
 
 
