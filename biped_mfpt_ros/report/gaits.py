@@ -48,8 +48,10 @@ FRAME_INTERVAL = 0.05
 
 _HOLD = 2.0  # s, of the last frame
 _FIGURE_INTERVAL = 0.11  # s between the figures of a sequence: five or six in a step
+_MOST_NUMBERS = 10  # slopes that can be written under a sequence
 _FRAME = (720, 420)  # pixels of a frame, at most
-_NARROWEST = 420  # pixels: the text has to fit
+_BANNER = 34  # pixels of a frame, above, for the text
+_NARROWEST = 1.7  # width of a scene over its height
 _FRAME_DPI = 130
 _COLOURS = 64  # of an animation
 _BODY_WEIGHT = 0.5  # m, length of the arrow of a force as large as the weight
@@ -206,31 +208,34 @@ def rough_walk(
 def gait(walk: RoughWalk) -> Picture:
     """Sequence of stick figures of the last steps of a walk, with the slopes in degrees."""
     walking = walk.figures(_FIGURE_INTERVAL)
-    ground = pictures.ground_line(walking)
-    length, top = np.ptp(ground[:, 0]), walking.points[:, 3, 1].max()
-    height = 5.0 * (max(top, ground[:, 1].max()) - ground[:, 1].min() + 0.24) / length
-    figure = new_figure(min(5.0, height + 0.75))
+    ground, low, top = _scene(walking)
+    room = 0.14  # m, for the numbers
+    figure = new_figure(5.0 * (top - low + room) / np.ptp(ground[:, 0]) + 0.9)
     axes = figure.subplots()
-    pictures.draw_walk(axes, walking)
-    low = axes.get_ylim()[0] - 0.14
-    axes.fill_between(ground[:, 0], ground[:, 1], low, color=GROUND, alpha=0.25, linewidth=0)
-    axes.collections[0].remove()  # the ground that was drawn before there were numbers in it
-    axes.set_ylim(bottom=low)
-    small = 7.5 if len(walk.swings) <= 9 else 6.0
-    for (x, y), (x_ahead, y_ahead), slope in zip(
-        walking.feet[:-1], walking.feet[1:], walking.slopes[1:], strict=True
-    ):
+    pictures.draw_walk(axes, walking, ground, 0.12 + room)
+    numbered = len(walk.swings) <= _MOST_NUMBERS
+    corners = zip(walking.feet[:-1], walking.feet[1:], walking.slopes[1:], strict=True)
+    for (x, y), (x_ahead, y_ahead), slope in corners if numbered else ():
         middle = (0.5 * (x + x_ahead), 0.5 * (y + y_ahead))
         axes.annotate(
             f"{math.degrees(slope):+.1f}°".replace("-", "−"), middle, (0, -4),
-            textcoords="offset points", ha="center", va="top", fontsize=small, color=BODY,
+            textcoords="offset points", ha="center", va="top", fontsize=7.5, color=BODY,
         )  # fmt: skip
     return Picture(
         f"{walk.controller.name} on rough ground",
-        f"{_sentence(walk)} A figure every {_FIGURE_INTERVAL:g} s, one leg blue and one orange; "
-        "the numbers are slopes.",
+        f"{_sentence(walk)} A figure every {_FIGURE_INTERVAL:g} s, one leg blue and one orange"
+        f"{'; the numbers are slopes' if numbered else ''}.",
         png(figure),
     )
+
+
+def _scene(walking: pictures.Walk) -> tuple[np.ndarray, float, float]:
+    """Ground of a picture, with more of it around a short walk, and its lower and upper end, m."""
+    ground = pictures.ground_line(walking)
+    top = max(ground[:, 1].max(), walking.points[:, 3, 1].max()) + 0.12
+    low = ground[:, 1].min() - 0.12
+    lacking = max(0.0, _NARROWEST * (top - low) - float(np.ptp(ground[:, 0])))
+    return pictures.ground_line(walking, 0.5 + 0.5 * lacking, 0.25 + 0.5 * lacking), low, top
 
 
 def animation(walk: RoughWalk) -> Picture:
@@ -259,17 +264,14 @@ def animation(walk: RoughWalk) -> Picture:
 
 def _frames(walk: RoughWalk, walking: pictures.Walk) -> list[np.ndarray]:
     """The frames of an animation, as `pixels`."""
-    ground = pictures.ground_line(walking)
-    top = max(ground[:, 1].max(), walking.points[:, 3, 1].max()) + 0.12
-    low = ground[:, 1].min() - 0.12
-    banner = 0.14  # of the height, for the text
-    scale = min(_FRAME[0] / np.ptp(ground[:, 0]), (1.0 - banner) * _FRAME[1] / (top - low))
-    width = max(round(scale * np.ptp(ground[:, 0])), _NARROWEST)
-    height = round(scale * (top - low) / (1.0 - banner))
+    ground, low, top = _scene(walking)
+    length = np.ptp(ground[:, 0])
+    scale = min(_FRAME[0] / length, (_FRAME[1] - _BANNER) / (top - low))
+    width, height = round(scale * length), round(scale * (top - low)) + _BANNER
     figure = new_figure(height / _FRAME_DPI, width / _FRAME_DPI)
     figure.set_dpi(_FRAME_DPI)
     figure.set_layout_engine("none")
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0 - banner))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0 - _BANNER / height))
     pictures.draw_ground(axes, ground, top - 0.12)
     axes.set_axis_off()
     axes.plot(*walking.feet[:-1].T, "|", color=GROUND, markersize=7)

@@ -173,9 +173,9 @@ def _label_plane(axes: Axes, plane: Plane) -> None:
     ):
         strongest = np.argsort(-np.abs(direction), kind="stable")[:3]
         terms = "".join(f"{'+' if direction[i] > 0 else '-'}{_NAMES[i]}" for i in strongest)
+        meaning = f"\n({share:.1%} of variance; mostly ${terms.removeprefix('+')}$)"
         axis.set_label_text(
-            f"{number_} component, standard deviations\n({share:.1%} of variance; mostly "
-            f"${terms.removeprefix('+')}$)"
+            f"{number_} component, standard deviations{meaning if plane.shares.any() else ''}"
         )
     tidy(axes)
 

@@ -211,9 +211,9 @@ def ground_line(walking: Walk, before: float = 0.5, after: float = 0.25) -> np.n
     return np.vstack([back, walking.feet, front])
 
 
-def draw_ground(axes: Axes, ground: np.ndarray, top: float) -> None:
+def draw_ground(axes: Axes, ground: np.ndarray, top: float, depth: float = 0.12) -> None:
     """Draw ground by its corners, and set the limits of the axes: up to ``top``, m, or more."""
-    low = ground[:, 1].min() - 0.12
+    low = ground[:, 1].min() - depth
     axes.fill_between(ground[:, 0], ground[:, 1], low, color=GROUND, alpha=0.25, linewidth=0)
     axes.plot(ground[:, 0], ground[:, 1], color=GROUND, linewidth=1.4)
     axes.set_aspect("equal")
@@ -221,9 +221,12 @@ def draw_ground(axes: Axes, ground: np.ndarray, top: float) -> None:
     axes.set_ylim(low, max(ground[:, 1].max(), top) + 0.12)
 
 
-def draw_walk(axes: Axes, walking: Walk) -> None:
-    """Draw a walk as a sequence of stick figures on its ground."""
-    draw_ground(axes, ground_line(walking), walking.points[:, 3, 1].max())
+def draw_walk(
+    axes: Axes, walking: Walk, ground: np.ndarray | None = None, depth: float = 0.12
+) -> None:
+    """Draw a walk as a sequence of stick figures on its ground, see `ground_line`, ``depth`` m."""
+    ground = ground_line(walking) if ground is None else ground
+    draw_ground(axes, ground, walking.points[:, 3, 1].max(), depth)
     last = len(walking.points) - 1
     for i, (points, step) in enumerate(zip(walking.points, walking.steps, strict=True)):
         # A leg keeps its colour: it is the stance leg in every second step.
@@ -238,8 +241,7 @@ def draw_walk(axes: Axes, walking: Walk) -> None:
     if walking.outcome is not Outcome.STEP:
         at = where_it_falls(walking)
         axes.plot(*at, "o", color=PAPER, markersize=9, fillstyle="none", markeredgewidth=1.8)
-        corner = {"transform": axes.transAxes, "ha": "right", "va": "top"}
-        axes.text(1.0, 1.0, walking.outcome.label, color=PAPER, **corner)
+        axes.set_title(walking.outcome.label, fontsize=10, loc="right", color=PAPER)
     axes.set_xlabel("distance, m")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(left=False, labelleft=False)

@@ -99,24 +99,36 @@ def with_palette(frames: Sequence[np.ndarray], colours: int) -> list[Image.Image
         At most, to 256.
     """
 
-    def coarse(code: np.ndarray) -> np.ndarray:
-        """18 of the 24 bits of a colour."""
-        return code >> 6 & 0x3F000 | code >> 4 & 0xFC0 | code >> 2 & 0x3F
+    def coarse(colour: np.ndarray) -> np.ndarray:
+        """18 of the 24 bits of colours."""
+        red, green, blue = np.moveaxis(colour >> 2, -1, 0).astype(np.int32)
+        return red << 12 | green << 6 | blue
 
-    codes = [frame.astype(np.int32) @ np.array([65536, 256, 1], np.int32) for frame in frames]
-    some = np.concatenate([code.ravel() for code in codes[:: max(1, len(codes) // 12)]])
-    found, counts = np.unique(np.concatenate([some, codes[-1].ravel()]), return_counts=True)
+    cells = [coarse(frame) for frame in frames]
+    # A few frames have all colours of an animation that are common.
+    counted = np.zeros(1 << 18, np.intp)
+    kinds = []
+    for i in sorted({*range(0, len(frames), max(1, len(frames) // 5)), len(frames) - 1}):
+        counted += np.bincount(cells[i].ravel(), minlength=1 << 18)
+        kinds.append(frames[i].reshape(-1, 3))
+    common = np.argsort(-counted, kind="stable")[: min(colours, np.count_nonzero(counted))]
+    # Of each cell that is common the commonest colour itself.
+    code = np.concatenate(kinds).astype(np.int32)
+    code = code[:, 0] << 16 | code[:, 1] << 8 | code[:, 2]
+    found, counts = np.unique(code, return_counts=True)
     found = found[np.argsort(-counts, kind="stable")]
-    _, commonest = np.unique(coarse(found), return_index=True)
-    chosen = found[np.sort(commonest)[:colours]]
-    palette = np.stack([chosen >> 16, chosen >> 8 & 255, chosen & 255], axis=1)
+    found = np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1)
+    where, first = np.unique(coarse(found), return_index=True)
+    palette = found[first[np.searchsorted(where, common)]]
 
-    cells = [coarse(code) for code in codes]
-    used = np.flatnonzero(np.bincount(np.concatenate([cell.ravel() for cell in cells])))
+    used = np.zeros(1 << 18, np.bool_)
+    for cell in cells:
+        used[cell] = True
+    (used,) = used.nonzero()
     centres = np.stack([used >> 12, used >> 6 & 63, used & 63], axis=1) * 4 + 2
     index = np.zeros(1 << 18, np.uint8)
     index[used] = np.square(centres[:, None] - palette).sum(axis=2).argmin(axis=1)
-    index[coarse(chosen)] = np.arange(len(chosen))
+    index[common] = np.arange(len(common))
     out = []
     for cell in cells:
         image = Image.fromarray(index[cell])
