@@ -69,9 +69,7 @@ def motion(control, state, switched=False, model=FREE):
     """Accelerations ddq and torques under a controller."""
     rate, work = np.empty(11), np.zeros((dynamics.WORKSPACE_ROWS, 5))
     y = np.append(dynamics.to_absolute(state), 0.0)
-    closed_loop(
-        control.code, switched, model.packed(), control.packed(model.robot), work, y, rate
-    )
+    closed_loop(control.code, switched, model.packed(), control.packed(model.robot), work, y, rate)
     return np.linalg.solve(ABSOLUTE, rate[5:10]), work[dynamics.TORQUE, :4].copy()
 
 
@@ -94,9 +92,7 @@ def test_tracking_error_on_the_flat_cycle(name):
     control = controller(name)
     cycle = find_limit_cycle(control)
     trace = trace_swing(control, cycle.state, 0.0, 0.0)
-    errors = [
-        outputs(name, control.parameters, x[:5], x[5:], np.zeros(5))[0] for x in trace.states
-    ]
+    errors = [outputs(name, control.parameters, x[:5], x[5:], np.zeros(5))[0] for x in trace.states]
     assert np.abs(errors).max() < 1e-4
 
 
