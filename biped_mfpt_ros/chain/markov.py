@@ -324,13 +324,14 @@ def _dense_distribution(targets: np.ndarray, probabilities: np.ndarray, start: i
     graph = csr_array(matrix)
     count, labels = connected_components(graph, connection="strong")
     classes = [np.flatnonzero(labels == label) for label in range(count)]
-    keys = []
+    keys, vectors = [], []
     for states in classes:
         leaves = falls[states] + matrix[states][:, labels != labels[states[0]]].sum(axis=1)
         q = matrix[np.ix_(states, states)]
         x = _squared(q, leaves, np.arange(len(states))) if q.any() else np.ones(1)
         # Near 1 the rates no longer tell small eigenvalues apart; what stays does.
         keys.append((float(x @ leaves), -float((x @ q).sum())))
+        vectors.append(x)
     best = min(range(count), key=keys.__getitem__)
     while True:
         below = np.sort(breadth_first_order(graph, classes[best][0], return_predecessors=False))
@@ -339,8 +340,8 @@ def _dense_distribution(targets: np.ndarray, probabilities: np.ndarray, start: i
         if not behind:
             break
         best = behind[0]
-    x = np.ones(1)
-    if len(below) > 1 or matrix[below[0], below[0]] > 0.0:
+    x = vectors[best]
+    if len(below) > len(x):
         among = np.searchsorted(below, classes[best])
         x = _squared(matrix[np.ix_(below, below)], falls[below], among)
     out = np.zeros(len(targets))
