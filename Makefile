@@ -9,7 +9,7 @@ unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_P
 .PHONY: help setup run reproduce test lint clean
 
 help: ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
 
 setup: ## set up .venv: ROS 2 wheels, messages, this package (first time about 90 s)
 	@PYTHON='$(PYTHON)' tools/setup
@@ -17,7 +17,7 @@ setup: ## set up .venv: ROS 2 wheels, messages, this package (first time about 9
 run: setup ## walk, mesh, compute the MFPT over ROS 2, record it; ARGS='--help' lists the options
 	@$(BIN)/biped-mfpt run $(ARGS)
 
-reproduce: setup ## the paper's tables and figures in runs/reproduce (10 min); ARGS='--quick': 1 min
+reproduce: setup ## the tables and figures of the paper (10 min); ARGS='--quick' takes 1
 	@$(BIN)/biped-mfpt reproduce $(ARGS)
 
 test: setup ## run the tests but the slow ones; ARGS='-m slow' runs those
