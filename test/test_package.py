@@ -27,7 +27,6 @@ ROSDEP_KEYS = {
     "pytest": "python3-pytest",
     "rosbags": "python3-rosbags-pip",
     "scipy": "python3-scipy",
-    "sympy": "python3-sympy",
     "yaml": "python3-yaml",
     "zstandard": "mcap-ros2-support",
 }

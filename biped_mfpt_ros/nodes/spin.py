@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -106,6 +107,8 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
                 close()
             node.destroy_node()
         rclpy.try_shutdown()
+        # Else the interpreter looks through all of numba's objects once more before it ends.
+        gc.freeze()
     return 0
 
 
@@ -119,5 +122,7 @@ def _spin(node: Node) -> None:
         except (KeyboardInterrupt, ExternalShutdownException):
             raise
         except Exception:
+            if not node.context.ok():
+                return  # a callback that ran into the shutdown
             # A client that has gone before its answer, a message that cannot be converted.
             node.get_logger().error(f"a callback failed; going on\n{traceback.format_exc()}")
