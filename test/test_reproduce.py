@@ -66,8 +66,19 @@ def made_up(plan, skip=(), mfpt=1.0, mean_steps=5.0):
             result = {"rows": [{"tolerance": 1e-7, "same": 1.0, "mean_steps": 5.0,
                                 "milliseconds": 0.3}]}  # fmt: skip
         else:
-            result = {"rows": [{"torques_off_late": False, "torque_limit": None,
-                                "slope_deg": -1.0, "steps": 3, "fell": None}]}  # fmt: skip
+            cases = ((False, -1.0, "falls"), (True, 0.0, None), (True, -9.0, None))
+            result = {
+                "rows": [
+                    {
+                        "torques_off_late": off,
+                        "torque_limit": 50.0,
+                        "slope_deg": slope,
+                        "steps": 3,
+                        "fell": fell,
+                    }
+                    for off, slope, fell in cases
+                ]
+            }
         out[job.name] = result
     return Results(plan, out)
 
@@ -190,6 +201,8 @@ class TestComparison:
             100.0 * (5.9 / 2.1511 - 1.0)
         )
         assert rows["order of merit in Table 5"]["verdict"] == UNKNOWN
+        claims = [row for row in rows.values() if row["by"] == "simulation"]
+        assert [row["verdict"] for row in claims] == [HOLDS] * 3
 
     def test_without_walks_the_finest_mesh_judges(self):
         plan = make_plan(["hzd/base"])
@@ -322,6 +335,7 @@ class TestWork:
         assert steps[False, 50.0, -1.0]["steps"] < 10
         assert steps[False, 50.0, -1.0]["fell"]
         assert steps[True, 50.0, 0.0]["steps"] == 20
+        assert steps[True, 50.0, -9.0]["fell"] is None
 
 
 # With the nodes, of the controller whose meshes have a few dozen states.

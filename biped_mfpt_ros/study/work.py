@@ -22,6 +22,7 @@ from biped_mfpt_ros.walker.robot import WalkerModel
 Count = Callable[[int, int], None]
 
 _PHASE_OFF = 0.95  # section 6.3: no torque above this phase
+_STEEPENING = math.radians(1.0)  # per step, from flat ground to a constant slope
 _MOST_STEPS = 20_000  # of a walk
 
 
@@ -134,12 +135,13 @@ def slopes(job: Job, state: list[float]) -> dict[str, Any]:
 def _steps_on(
     walking: Controller, slope: float, model: WalkerModel, state: list[float], most: int
 ) -> dict[str, Any]:
-    """Steps on a constant slope, from flat ground, until the fall."""
+    """Steps until the fall where flat ground gets steeper up to a constant slope."""
     at, behind = np.array([state]), 0.0
     for taken in range(most):
-        steps = simulate_steps(walking, at, [behind], [slope], model)
+        ahead = math.copysign(min(abs(slope), (taken + 1) * _STEEPENING), slope)
+        steps = simulate_steps(walking, at, [behind], [ahead], model)
         outcome = Outcome(int(steps.outcomes[0, 0]))
         if outcome is not Outcome.STEP:
             return {"steps": taken, "fell": outcome.label}
-        at, behind = steps.next_states, slope
+        at, behind = steps.next_states, ahead
     return {"steps": most, "fell": None}
