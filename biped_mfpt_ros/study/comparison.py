@@ -534,8 +534,8 @@ def _slopes(results: Results) -> Table:
         ],
         (
             "The paper: the controller cannot take more than several steps down 1°; with no "
-            "torque where τ > 0.95 it still walks on flat ground, and down 9°. Here it comes from flat "
-            "ground that gets steeper by 1° a step.",
+            "torque where τ > 0.95 it still walks on flat ground, and down 9°. Here it comes from "
+            "flat ground that gets steeper by 1° a step.",
         ),
     )  # fmt: skip
 
