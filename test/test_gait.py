@@ -83,6 +83,15 @@ def test_a_cycle_comes_back_to_itself_and_its_eigenvalues_tell_how():
     assert abs(cycle.eigenvalues[-1]) < 1e-5
 
 
+def test_a_stable_cycle_is_preferred_to_an_unstable_one():
+    """This gait has a fast unstable cycle besides the one it settles in; Newton finds both."""
+    control = controller("smc/base")
+    model = WalkerModel(torque_limit=46.0, slip_duration=0.005)
+    cycle = find_limit_cycle(control, model=model)
+    assert cycle.stable
+    assert cycle.speed == pytest.approx(0.73, abs=0.03)
+
+
 def test_no_cycle_is_an_error_that_says_how_it_ended():
     with pytest.raises(NoLimitCycle, match=r"hzd/base .* slope of -5 degrees .* most falls: "):
         find_limit_cycle(controller("hzd/base"), math.radians(-5.0))

@@ -80,7 +80,7 @@ def find_limit_cycle(
 
     Starts are states without tracking error over a range of speeds, or ``guess``. They walk on as
     long as they do not fall; from the most periodic ones Newton's method finishes, so that unstable
-    cycles and those with a slow mode are found too.
+    cycles and those with a slow mode are found too. A stable cycle is preferred to an unstable one.
 
     Parameters
     ----------
@@ -113,6 +113,7 @@ def find_limit_cycle(
     else:
         states = check_states(np.atleast_2d(np.asarray(guess, dtype=np.float64)), "guess")
     falls: np.ndarray = np.empty(0, dtype=np.uint8)
+    unstable: LimitCycle | None = None
     behind = slope if guess is not None else 0.0  # the starts come from flat ground
     for walked in range(_WALK_STEPS):
         steps = simulate_steps(controller, states, np.full(len(states), behind), [slope], model)
@@ -126,9 +127,12 @@ def find_limit_cycle(
         # Newton from the start is cheap and catches unstable cycles; later only near a cycle.
         if walked in (0, 5, _WALK_STEPS - 1) or distance[best] < 1e-3:
             cycle = _newton(controller, slope, model, steps.next_states[best])
-            if cycle is not None:
+            if cycle is not None and cycle.stable:
                 return cycle
+            unstable = unstable or cycle
         states = steps.next_states
+    if unstable is not None:
+        return unstable
     reason = "walked on without becoming periodic"
     if falls.size:
         common = Outcome(int(np.bincount(falls).argmax()))
