@@ -28,7 +28,7 @@ from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
 from biped_mfpt_ros.report.style import Picture
 from biped_mfpt_ros.report.tables import difference, table
 from biped_mfpt_ros.study import work
-from biped_mfpt_ros.study.comparison import Results, curves, tables
+from biped_mfpt_ros.study.comparison import Results, curves, mfpt_of, tables
 from biped_mfpt_ros.study.plan import SIGMA_DEG, Job, Plan, make_plan, scheme_of
 from biped_mfpt_ros.study.readings import readings
 from biped_mfpt_ros.study.store import Store
@@ -174,9 +174,12 @@ def _pictures(study: _Study, job: Job, state: list[float], directory: Path) -> d
     from biped_mfpt_ros.report.gallery import gallery
 
     mesh = None
-    result = study.results.get(study.plan.of("mesh", job.controller)[-1].name)
-    if result is not None:
-        mesh = read_meshes(directory / result["bag"])[result["mesh_id"]].mesh
+    for grown in reversed(study.plan.of("mesh", job.controller)):
+        result = study.results.get(grown.name)
+        # The finest one whose chain could be solved.
+        if result and mfpt_of(grown.settings | result, job.settings["sigma_deg"]) is not None:
+            mesh = read_meshes(directory / result["bag"])[result["mesh_id"]].mesh
+            break
     pictures = gallery(
         controller(job.controller),
         readings()[job.controller].model,
