@@ -327,7 +327,9 @@ class TestWork:
         assert rows[1]["same"] >= 0.98
 
     def test_slopes(self, state):
-        rows = work.slopes(Job("slopes", "hzd/base", {"steps": 20}), state)["rows"]
+        rows = work.slopes(Job("slopes", "hzd/base", {"steps": 20, "steepening_deg": 1.0}), state)[
+            "rows"
+        ]
         steps = {(r["torques_off_late"], r["torque_limit"], r["slope_deg"]): r for r in rows}
         assert steps[False, 50.0, 0.0]["steps"] == 20
         assert steps[False, 50.0, 0.0]["fell"] is None

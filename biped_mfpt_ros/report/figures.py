@@ -126,7 +126,7 @@ def convergence(name: str, results: Results) -> Picture:
         axes.set_xscale("log")
         _few_ticks(axes, [mesh["states"] for mesh in meshes])
         wide = max(values, default=1.0) > 20.0 * min(values, default=1.0)
-        if wide:
+        if wide or max(values, default=1.0) > 1e4:
             _steps_axis(axes)
         else:
             axes.set_ylim(0.0, 1.15 * max(values, default=1.0))

@@ -445,9 +445,6 @@ def _convergence(results: Results) -> Table:
             Column("slope_step_deg", "d_s, °"),
             Column("threshold", "d_thr"),
             Column("states", "states", COUNT),
-            Column("generations", "generations", COUNT),
-            Column("seconds", "time", SECONDS),
-            Column("swings_per_second", "swings/s", COUNT),
             *(
                 column
                 for sigma in sigmas
@@ -456,6 +453,9 @@ def _convergence(results: Results) -> Table:
                     Column(f"bias_{sigma:g}", "from Monte Carlo", DIFFERENCE),
                 )
             ),
+            Column("generations", "generations", COUNT),
+            Column("seconds", "time", SECONDS),
+            Column("swings_per_second", "swings/s", COUNT),
         ),
         rows,
         ("Differences are from Monte Carlo here, where its walks are short enough.",),
@@ -695,7 +695,7 @@ def _claims(results: Results) -> list[dict[str, Any]]:
     found = results.slopes()
     if found is None:
         return [walk]
-    limited = [row for row in found["rows"] if row["torque_limit"] is not None]
+    limited = [row for row in found["rows"] if math.isfinite(float(row["torque_limit"]))]
     case = {(row["torques_off_late"], row["slope_deg"]): row for row in limited}
     down, off, steep = case[False, -1.0], case[True, 0.0], case[True, -9.0]
     return [

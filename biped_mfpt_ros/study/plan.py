@@ -249,7 +249,7 @@ def make_plan(
                 )
             )
     if "hzd/base" in names:
-        jobs.append(Job("slopes", "hzd/base", {"steps": 100}, 1.0))
+        jobs.append(Job("slopes", "hzd/base", {"steps": 100, "steepening_deg": 1.0}, 1.0))
     if drawing:
         for name in names:
             about = {"sigma_deg": _PICTURE_DEG[name], "animated": not quick, "drawing": drawing}

@@ -22,7 +22,6 @@ from biped_mfpt_ros.walker.robot import WalkerModel
 Count = Callable[[int, int], None]
 
 _PHASE_OFF = 0.95  # section 6.3: no torque above this phase
-_STEEPENING = math.radians(1.0)  # per step, from flat ground to a constant slope
 _MOST_STEPS = 20_000  # of a walk
 
 
@@ -114,6 +113,7 @@ def slopes(job: Job, state: list[float]) -> dict[str, Any]:
     base = controller(job.controller)
     off = Controller(f"{base.name}/off", base.scheme, np.append(base.parameters, _PHASE_OFF))
     model, most = readings()[job.controller].model, job.settings["steps"]
+    steepening = math.radians(job.settings["steepening_deg"])
     limitless = replace(model, torque_limit=math.inf)
     cases = (
         (base, 0.0, model), (base, -1.0, model), (base, -1.0, limitless),
@@ -123,9 +123,9 @@ def slopes(job: Job, state: list[float]) -> dict[str, Any]:
         "rows": [
             {
                 "torques_off_late": walking is off,
-                "torque_limit": None if math.isinf(limits.torque_limit) else limits.torque_limit,
+                "torque_limit": limits.torque_limit,
                 "slope_deg": degrees,
-                **_steps_on(walking, math.radians(degrees), limits, state, most),
+                **_steps_on(walking, math.radians(degrees), limits, state, most, steepening),
             }
             for walking, degrees, limits in cases
         ]
@@ -133,12 +133,17 @@ def slopes(job: Job, state: list[float]) -> dict[str, Any]:
 
 
 def _steps_on(
-    walking: Controller, slope: float, model: WalkerModel, state: list[float], most: int
+    walking: Controller,
+    slope: float,
+    model: WalkerModel,
+    state: list[float],
+    most: int,
+    steepening: float,
 ) -> dict[str, Any]:
-    """Steps until the fall where flat ground gets steeper up to a constant slope."""
+    """Steps until the fall where flat ground gets steeper, step by step, to a constant slope."""
     at, behind = np.array([state]), 0.0
     for taken in range(most):
-        ahead = math.copysign(min(abs(slope), (taken + 1) * _STEEPENING), slope)
+        ahead = math.copysign(min(abs(slope), (taken + 1) * steepening), slope)
         steps = simulate_steps(walking, at, [behind], [ahead], model)
         outcome = Outcome(int(steps.outcomes[0, 0]))
         if outcome is not Outcome.STEP:
