@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import base64
+import itertools
 import os
 import shutil
 import time
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +39,8 @@ from biped_mfpt_ros.walker.terrain import slope_set
 
 _MOST_STATES = 200_000
 _RETRY = 0.05  # s
+_SETTLE = 0.2  # s
+_MOST_TRIES = 3  # for a mesh to be in its bag
 _PRIOR = 60.0  # s of work after which the pace is believed rather than the plan
 _RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
 
@@ -228,36 +232,50 @@ def _meshes(
     published = sorted({s for job in jobs for s in SIGMA_DEG[scheme_of(job.controller)]})
     pipeline.start(workers, 0.0, published)
     last: _Recording | None = None
+    queue, tries = deque(jobs), Counter[str]()
     with Client(namespace, pipeline.watch) as client:
-        for i, job in enumerate(jobs):
-            start = time.monotonic()
-            bag = bags / job.name
-            if bag.exists():
-                shutil.rmtree(bag)  # of a mesh that was stopped
-            name = f"recorder_{i}"
-            recorder = pipeline.record(name, bag, earlier=False)
+        while queue or last is not None:
+            job = queue.popleft() if queue else None
+            if job is not None:
+                start = time.monotonic()
+                tries[job.name] += 1
+                name = f"recorder_{tries.total()}"
+                bag = bags / job.name
+                if bag.exists():
+                    shutil.rmtree(bag)  # of a mesh that was stopped, or not heard to its end
+                recorder = pipeline.record(name, bag, earlier=False)
             # The bag of the mesh before is closed and checked while this recorder starts.
-            _close(study, processes, last)
-            if not i:
+            if last is not None:
+                problem = _close(study, last)
+                if problem and tries[last.job.name] == _MOST_TRIES:
+                    raise CommandError(f"{last.bag}: the mesh cannot be read back ({problem})")
+                if problem:
+                    queue.append(last.job)
+                last = None
+            if job is None:
+                continue
+            if tries.total() == 1:
                 client.wait(partial(pipeline.up, client), START_TIMEOUT, "the nodes to come up")
                 study.seconds["starting nodes"] = time.monotonic() - started
             study.show(job, "starting its recorder")
             client.wait(
                 partial(client.listens, name, _RECORDED), START_TIMEOUT, f"{name} to come up"
             )
-            result = _grow(study, job, client)
+            result = _grow(study, job, client, published)
             processes.end(recorder)
             last = _Recording(
-                job, result | {"bag": str(bag.relative_to(directory))}, recorder, bag,
+                job,
+                result | {"bag": str(bag.relative_to(directory))},
+                recorder,
+                bag,
                 time.monotonic() - start,
-            )  # fmt: skip
-    _close(study, processes, last)
+            )
     # The walks can have all cores.
     study.show(jobs[-1], "stopping the nodes")
     processes.stop()
 
 
-def _grow(study: _Study, job: Job, client: Any) -> dict[str, Any]:
+def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[str, Any]:
     """Grow a mesh, and have the analysis compute its MFPT."""
     from biped_mfpt_ros.nodes.messages import MeshSettings
 
@@ -284,6 +302,13 @@ def _grow(study: _Study, job: Job, client: Any) -> dict[str, Any]:
     study.show(job)
     grown = client.grow_mesh(settings, feedback)
     estimates = _estimates(study, job, client, grown.mesh_id)
+    # What the analysis publishes comes last: when it is here, the recorder will have it soon.
+    solved = [s for s, e in zip(job.settings["sigma_deg"], estimates, strict=True) if e is not None]
+    first = itertools.takewhile(lambda sigma: sigma in solved, published)
+    client.published_mfpt(
+        grown.mesh_id, 0.0, [options.spread("sigma", deg) for deg in first], RESULT_TIMEOUT
+    )
+    time.sleep(_SETTLE)
     return {
         "mesh_id": grown.mesh_id,
         "states": grown.states,
@@ -330,10 +355,8 @@ def _estimates(study: _Study, job: Job, client: Any, mesh_id: str) -> list[Any]:
     return out
 
 
-def _close(study: _Study, processes: Processes, recording: _Recording | None) -> None:
-    """Wait for a recorder to end, make sure that the mesh is in the bag, and keep the result."""
-    if recording is None:
-        return
+def _close(study: _Study, recording: _Recording) -> str:
+    """Wait for a recorder to end and keep the result; says what is missing in the bag, if so."""
     from biped_mfpt_ros.bag import read_meshes
 
     start = time.monotonic()
@@ -344,12 +367,9 @@ def _close(study: _Study, processes: Processes, recording: _Recording | None) ->
         )
     found = read_meshes(recording.bag).get(recording.result["mesh_id"])
     if found is None or found.mesh is None:
-        why = "not there" if found is None else found.problem
-        raise CommandError(
-            f"{recording.bag}: the mesh cannot be read back ({why}); the same command again "
-            "records it anew and goes on from here"
-        )
+        return "it is not there" if found is None else found.problem
     study.finish(recording.job, recording.result, recording.seconds + time.monotonic() - start)
+    return ""
 
 
 # The report -------------------------------------------------------------------------------------
