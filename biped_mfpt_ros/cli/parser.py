@@ -382,7 +382,7 @@ counter-clockwise is positive and the robot walks towards +x. `biped-mfpt cycle`
 
 examples:
   biped-mfpt step --controller hzd/base --previous-slope 0 --slope -2 \\
-      --state 3.6351,3.0548,-0.4360,-0.3399,-0.0161,-0.57,0.32,-0.91,0.45,0.26
+      --state 3.6151,3.0349,-0.4162,-0.3200,-0.0158,0.3741,-1.9168,-3.5620,1.0227,0.1408
 """,
         "walker",
         "output",
