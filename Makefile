@@ -27,6 +27,9 @@ lint: setup ## check style and types
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
 
+bench: setup ## time step map, mesh and chain; ARGS='--short' or ARGS='--json'
+	@$(BIN)/python -m biped_mfpt_ros.bench $(ARGS)
+
 clean: ## remove all that the other targets made, .venv included
 	rm -rf .venv build .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,28 @@
+"""The benchmarks run and check what they time; their times are never judged here."""
+
+from __future__ import annotations
+
+import json
+
+from biped_mfpt_ros import bench
+
+
+def test_short_benchmarks(capsys):
+    assert bench.main(["--short", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert all(0 < row["low"] <= row["median"] <= row["high"] for row in result["rows"])
+    assert result["ratios"]["scipy_over_step_map"] > 0
+
+
+def test_a_wrong_result_is_an_error(capsys, monkeypatch):
+    true = bench.simulate_steps
+
+    def wrong(*arguments):
+        steps = true(*arguments)
+        tight = len(arguments) == 5 and arguments[4] is not None
+        steps.next_states[:] += 1e-3 * tight
+        return steps
+
+    monkeypatch.setattr(bench, "simulate_steps", wrong)
+    assert bench.main(["--short"]) == 1
+    assert "error" in capsys.readouterr().err
