@@ -153,8 +153,8 @@ def test_everything_published_is_in_the_bag(graph, tmp_path):
     progress = recorded.pop("/run/mesh/progress")
     last = publisher.sent.pop("/run/mesh/progress")[-1]
     assert deserialize_message(progress[-1], messages.MeshProgress) == last
-    # Each once. A late joiner may get a new message before the latched ones: they are told apart, and
-    # put in order, by their counters.
+    # Each once. A late joiner may get a new message before the latched ones: their counters tell
+    # them apart and put them in order.
     assert publisher.sent == {
         topic: sorted(
             (deserialize_message(data, kinds[topic]) for data in all_data),
