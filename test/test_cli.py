@@ -395,6 +395,19 @@ def alive(pid):
 
 
 class TestProcesses:
+    @pytest.fixture(autouse=True)
+    def signals_as_in_a_terminal(self):
+        """In the background a shell ignores SIGINT, and nohup SIGHUP; what is started inherits it."""
+        usual = {
+            signal.SIGINT: signal.default_int_handler,
+            signal.SIGTERM: signal.SIG_DFL,
+            signal.SIGHUP: signal.SIG_DFL,
+        }
+        before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+        yield
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
     def test_stops_in_order(self, tmp_path):
         script = (
             "import pathlib, signal, sys, time\n"
