@@ -397,7 +397,7 @@ def alive(pid):
 class TestProcesses:
     @pytest.fixture(autouse=True)
     def signals_as_in_a_terminal(self):
-        """In the background a shell ignores SIGINT, and nohup SIGHUP; what is started inherits it."""
+        """In the background a shell ignores SIGINT, and nohup SIGHUP: children inherit that."""
         usual = {
             signal.SIGINT: signal.default_int_handler,
             signal.SIGTERM: signal.SIG_DFL,
