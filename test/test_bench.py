@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 
-from biped_mfpt_ros import bench
+from biped_mfpt_ros.bench import __main__ as bench
+from biped_mfpt_ros.bench import step_map
 
 
 def test_short_benchmarks(capsys):
@@ -15,7 +16,7 @@ def test_short_benchmarks(capsys):
 
 
 def test_a_wrong_result_is_an_error(capsys, monkeypatch):
-    true = bench.simulate_steps
+    true = step_map.simulate_steps
 
     def wrong(*arguments):
         steps = true(*arguments)
@@ -23,6 +24,6 @@ def test_a_wrong_result_is_an_error(capsys, monkeypatch):
         steps.next_states[:] += 1e-3 * tight
         return steps
 
-    monkeypatch.setattr(bench, "simulate_steps", wrong)
+    monkeypatch.setattr(step_map, "simulate_steps", wrong)
     assert bench.main(["--short"]) == 1
     assert "error" in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""Benchmarks: `make bench`. One file to a subject, each with ``run(short) -> Section``."""
