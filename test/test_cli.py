@@ -255,6 +255,8 @@ class TestHelp:
         for option in ("torque_limit", "friction", "slip_duration", "time_limit", "tolerance"):
             shown = texts[option].partition("(default: ")[2].rstrip(")")
             assert float(shown) == getattr(defaults, option), option
+        shown = texts["friction_frame"].partition("(default: ")[2].rstrip(")")
+        assert shown == defaults.friction_frame
 
     def test_is_quick_because_nothing_heavy_is_imported(self):
         # Time itself depends on the machine; what costs time is importing these.
@@ -325,15 +327,18 @@ class TestMesh:
 
         result = run_json(
             capsys, "mfpt", *self.ARGUMENTS, "--sigma", "1.5", "--mean", "-0.5",
-            "--unclustered", "--friction", "0.7",
+            "--unclustered", "--friction", "0.7", "--friction-frame", "vertical",
+            "--scale-refresh", "addition",
         )  # fmt: skip
-        walking, slopes, model = controller("hzd/cot"), slope_set(0.5), WalkerModel(friction=0.7)
+        walking, slopes = controller("hzd/cot"), slope_set(0.5)
+        model = WalkerModel(friction=0.7, friction_frame="vertical")
         mesh = grow_mesh(
             lambda states, previous: simulate_steps(walking, states, previous, slopes, model),
             find_limit_cycle(walking, model=model).state,
             slopes,
             0.3,
             clustered=False,
+            scale_refresh="addition",
         )
         expected = metastability(mesh, math.radians(-0.5), math.radians(1.5))
         assert result["states"] == len(mesh.states)

@@ -55,7 +55,7 @@ def brute_force(candidate, states, scales):
     return d
 
 
-def plain_algorithm_1(simulate, start, slopes, threshold, clustered):
+def plain_algorithm_1(simulate, start, slopes, threshold, clustered, scale_refresh):
     """Algorithm 1 as in the paper, one state and one slope at a time, on Python lists."""
 
     def spread(xs):
@@ -63,6 +63,11 @@ def plain_algorithm_1(simulate, start, slopes, threshold, clustered):
         r = xs.std(axis=0) if len(xs) else np.zeros(10)
         r[r <= 1e-12 * np.abs(xs).max(axis=0, initial=1.0)] = 0.0
         return r
+
+    def refreshed(x, candidates):
+        r = spread(x)
+        r = np.where(r > 0.0, r, spread(candidates))
+        return np.where(r > 0.0, r, np.inf)
 
     x, clusters, generations, results = [start], [list(slopes).index(0.0)], [0], {}
     frontier, generation = [0], 0
@@ -73,14 +78,14 @@ def plain_algorithm_1(simulate, start, slopes, threshold, clustered):
             states = iter(answer.next_states)
             results[i] = [next(states) if o == 0 else None for o in answer.outcomes[0]]
         candidates = [c for i in frontier for c in results[i] if c is not None]
-        r = spread(x)
-        r = np.where(r > 0.0, r, spread(candidates))
-        r = np.where(r > 0.0, r, np.inf)
+        r = refreshed(x, candidates)
         first = len(x)
         for i in frontier:
             for s, candidate in enumerate(results[i]):
                 if candidate is None:
                     continue
+                if scale_refresh == "addition":
+                    r = refreshed(x, candidates)
                 same = [j for j in range(len(x)) if not clustered or clusters[j] == s]
                 if all(brute_force(candidate, np.array(x)[same], r) > threshold):
                     x.append(candidate)
@@ -105,9 +110,14 @@ def mesh(request):
 
 @pytest.mark.parametrize("clustered", [True, False])
 @pytest.mark.parametrize("threshold", [0.3, 1.0, 30.0])
-def test_mesh_is_that_of_the_plain_algorithm(clustered, threshold):
-    mesh = grow_mesh(Toy(), START, SLOPES, threshold, clustered=clustered)
-    x, clusters, generations, r = plain_algorithm_1(Toy(), START, SLOPES, threshold, clustered)
+@pytest.mark.parametrize("scale_refresh", ["generation", "addition"])
+def test_mesh_is_that_of_the_plain_algorithm(clustered, threshold, scale_refresh):
+    mesh = grow_mesh(
+        Toy(), START, SLOPES, threshold, clustered=clustered, scale_refresh=scale_refresh
+    )
+    x, clusters, generations, r = plain_algorithm_1(
+        Toy(), START, SLOPES, threshold, clustered, scale_refresh
+    )
     assert np.array_equal(mesh.states[1:], x)
     assert mesh.preceding[1:].tolist() == clusters
     assert mesh.generation[1:].tolist() == generations
@@ -358,6 +368,12 @@ def test_dimension_that_spreads_late_counts_from_then_on():
 def test_limit_is_an_error_with_the_numbers_in_it():
     n = len(grow_mesh(Toy(), START, SLOPES, 0.3).states)
     assert len(grow_mesh(Toy(), START, SLOPES, 0.3, max_states=n).states) == n
+    n = len(grow_mesh(Toy(), START, SLOPES, 0.3, scale_refresh="addition").states)
+    assert n == len(
+        grow_mesh(Toy(), START, SLOPES, 0.3, scale_refresh="addition", max_states=n).states
+    )
+    with pytest.raises(MeshLimitError):
+        grow_mesh(Toy(), START, SLOPES, 0.3, scale_refresh="addition", max_states=n - 1)
     with pytest.raises(MeshLimitError) as caught:
         grow_mesh(Toy(), START, SLOPES, 0.3, max_states=50)
     error = caught.value
@@ -391,6 +407,7 @@ def test_limit_is_an_error_with_the_numbers_in_it():
         ("threshold", {"threshold": "0.3"}),
         ("initial_slope", {"initial_slope": 0.01}),
         ("initial_slope", {"initial_slope": np.nan}),
+        ("scale_refresh", {"scale_refresh": "state"}),
         ("max_states", {"max_states": 1}),
         ("max_states", {"max_states": 2**32}),
         ("max_states", {"max_states": 100.5}),

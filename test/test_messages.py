@@ -79,9 +79,10 @@ def test_controller_with_infinite_limit_round_trip():
     st.floats(0.0, 1.0),
     st.floats(0.0, 60.0, exclude_min=True),
     st.floats(1e-13, 1e-2),
+    st.sampled_from(["slope", "vertical"]),
 )
-def test_model_round_trip(torque_limit, friction, slip_duration, time_limit, tolerance):
-    model = WalkerModel(torque_limit, friction, slip_duration, time_limit, tolerance)
+def test_model_round_trip(torque_limit, friction, slip_duration, time_limit, tolerance, frame):
+    model = WalkerModel(torque_limit, friction, slip_duration, time_limit, tolerance, frame)
     assert messages.model_from(sent(messages.model_message(model))) == model
 
 
@@ -92,6 +93,7 @@ def settings(**changes):
         "slopes": slope_set(5.0),
         "threshold": 0.3,
         "clustered": False,
+        "scale_refresh": "addition",
         "max_states": 1234,
         "initial_state": np.linspace(-1.0, 1.0, 10),
         "initial_slope": math.radians(-5.0),
@@ -106,16 +108,19 @@ def test_settings_round_trip(initial_state):
     assert same_bits(got.slopes, made.slopes)
     assert same_bits(got.controller.parameters, made.controller.parameters)
     assert got.model == made.model
-    assert (got.threshold, got.clustered, got.max_states, got.initial_slope) == (
-        made.threshold,
-        made.clustered,
-        made.max_states,
-        made.initial_slope,
-    )
+    for name in ("threshold", "clustered", "scale_refresh", "max_states", "initial_slope"):
+        assert getattr(got, name) == getattr(made, name), name
     if initial_state is None:
         assert got.initial_state is None
     else:
         assert same_bits(got.initial_state, initial_state)
+
+
+def test_what_a_message_leaves_empty_is_the_default():
+    message = messages.settings_message(settings())
+    message.model.friction_frame = message.scale_refresh = ""
+    got = messages.settings_from(sent(message))
+    assert (got.model.friction_frame, got.scale_refresh) == ("slope", "generation")
 
 
 def edit(message, path, value):
@@ -133,6 +138,7 @@ def edit(message, path, value):
         ("model.torque_limit", -1.0, "model.torque_limit"),
         ("model.friction", math.nan, "model.friction"),
         ("model.time_limit", math.inf, "model.time_limit"),
+        ("model.friction_frame", "horizontal", "model.friction_frame"),
         ("slopes", [], "slopes"),
         ("slopes", [0.1, 0.0], "slopes[1]"),
         ("slopes", [0.0, math.nan], "slopes[1]"),
@@ -141,6 +147,7 @@ def edit(message, path, value):
         ("threshold", -1.0, "threshold"),
         ("threshold", math.nan, "threshold"),
         ("threshold", math.inf, "threshold"),
+        ("scale_refresh", "state", "scale_refresh"),
         ("max_states", 1, "max_states"),
         ("initial_state", [0.0] * 9, "initial_state"),
         ("initial_state", [0.0] * 9 + [math.nan], "initial_state[0][9]"),

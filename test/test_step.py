@@ -237,6 +237,31 @@ def test_a_short_slip_counts_only_if_it_lasts():
     assert outcome(0.0045) == Outcome.STEP
 
 
+def test_friction_at_impact_is_judged_in_the_chosen_frame():
+    """The impulse that the ground gives is leaned by the slope from one frame to the other."""
+    control, state = controller("hzd/base"), cycle_state("hzd/base")
+    for slope in np.radians([-2.0, 1.0, 3.0]):
+        free = WalkerModel(friction=math.inf, torque_limit=math.inf)
+        swing = trace_swing(control, state, 0.0, slope, free)
+        _, impulse = impact_map(swing.states[-1], ROBOT)
+        normal = np.array([-math.sin(slope), math.cos(slope)])
+        along = np.array([math.cos(slope), math.sin(slope)])
+        needed = {
+            "slope": abs(impulse @ along) / (impulse @ normal),
+            "vertical": abs(impulse[0]) / impulse[1],
+        }
+        assert abs(needed["slope"] - needed["vertical"]) > 0.01
+        for frame, ratio in needed.items():
+            for factor, sticks in ((0.999, False), (1.001, True)):
+                model = replace(free, friction=factor * ratio, friction_frame=frame)
+                # The swing itself may slip at so little friction: it is not what is tested.
+                model = replace(model, slip_duration=1.0)
+                outcome = simulate_steps(control, [state], [0.0], [slope], model).outcomes[0, 0]
+                assert (outcome == Outcome.STEP) == sticks, (slope, frame, factor)
+                if not sticks:
+                    assert outcome == Outcome.IMPACT_SLIPS
+
+
 FINITE = st.floats(-1e6, 1e6) | st.floats(-4, 4)
 
 

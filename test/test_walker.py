@@ -202,6 +202,7 @@ def test_slope_set_of_the_paper():
         (lambda: WalkerModel(slip_duration=-1.0), "slip_duration"),
         (lambda: WalkerModel(time_limit=0.0), "time_limit"),
         (lambda: WalkerModel(tolerance=1.0), "tolerance"),
+        (lambda: WalkerModel(friction_frame="level"), "friction_frame"),
     ],
 )
 def test_values_that_are_not_allowed_are_named(call, field):

@@ -96,7 +96,7 @@ class MeshReport:
         Why the mesh cannot be rebuilt; empty if it was.
     controller, scheme : str
         What walks; empty if the bag does not say.
-    model : dict of str to float
+    model : dict of str to float or str
         What it walks with.
     slopes : int
         Size of the slope set.
@@ -104,6 +104,8 @@ class MeshReport:
         d_thr.
     clustered : bool
         Whether the nearest state was sought among those of the same preceding slope.
+    scale_refresh : str
+        When the scales of eq. (25) were computed anew, ``generation`` or ``addition``.
     step_map : str
         Identity of the step map that simulated it.
     seconds : float
@@ -120,10 +122,11 @@ class MeshReport:
     problem: str
     controller: str
     scheme: str
-    model: dict[str, float]
+    model: dict[str, Any]
     slopes: int
     threshold: float
     clustered: bool
+    scale_refresh: str
     step_map: str
     seconds: float
     states: int
@@ -323,6 +326,7 @@ def _mesh_report(
         slopes=len(settings.slopes) if settings else 0,
         threshold=settings.threshold if settings else 0.0,
         clustered=bool(settings and settings.clustered),
+        scale_refresh=settings.scale_refresh if settings else "",
         step_map=recorded.step_map,
         seconds=recorded.seconds,
         states=len(mesh.states) if mesh else 0,
@@ -332,8 +336,10 @@ def _mesh_report(
     )
 
 
-def _model(model: Any) -> dict[str, float]:
-    names = ("torque_limit", "friction", "slip_duration", "time_limit", "tolerance")
+def _model(model: Any) -> dict[str, Any]:
+    names = (
+        "torque_limit", "friction", "friction_frame", "slip_duration", "time_limit", "tolerance",
+    )  # fmt: skip
     return {name: getattr(model, name) for name in names}
 
 

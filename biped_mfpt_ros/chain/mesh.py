@@ -6,7 +6,7 @@ of the slopes. What comes out depends on the answers of the step map alone, not 
 them, in how many pieces, or when. So a mesh is resumed by growing it again with a `simulate` that
 takes what was recorded from the record and simulates only the rest.
 
-The paper leaves open when the scales r_i of eq. (25) are refreshed. Here:
+The paper leaves open when the scales r_i of eq. (25) are refreshed. Here, by default:
 
 - r_i is the standard deviation of dimension i over the states of X, x_1 left out, at the start of
   each generation's tests. It stays the same while one generation is tested.
@@ -15,6 +15,9 @@ The paper leaves open when the scales r_i of eq. (25) are refreshed. Here:
   its scales this way.
 - A dimension in which these have no spread either gets r_i = inf: it says nothing about how far
   apart two states are, and its term of eq. (25) is 0.
+
+With `scale_refresh="addition"`, r_i is refreshed after each state that is added, as Algorithm 1
+says if taken to the letter; the rules for dimensions without spread are the same.
 
 The last generation adds no state, so its scales are those of the final X, and they decide the
 targets of eq. (27).
@@ -32,6 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from biped_mfpt_ros.chain.nearest import STATE_SIZE, StateSet
+from biped_mfpt_ros.chain.refresh import additions
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.terrain import check_slopes
@@ -41,6 +45,9 @@ NOT_SIMULATED = 255
 
 DEFAULT_MAX_STATES = 100_000
 """Default limit on the states of a mesh."""
+
+SCALE_REFRESHES = ("generation", "addition")
+"""When r_i of eq. (25) can be computed anew: for each generation, or after each addition to X."""
 
 # Relative to the largest value of a dimension, or to 1 rad or rad/s, as small values may come from
 # the difference of large ones. Rounding in a step leaves some 1e-16 to 1e-14, and the step map is
@@ -291,6 +298,7 @@ def grow_mesh(
     *,
     initial_slope: float = 0.0,
     clustered: bool = True,
+    scale_refresh: str = "generation",
     max_states: int = DEFAULT_MAX_STATES,
     on_generation: OnGeneration | None = None,
 ) -> Mesh:
@@ -313,6 +321,10 @@ def grow_mesh(
     clustered : bool, optional
         Take distances only to states of the same preceding slope (default), or to all states. A
         successor without any state in its cluster is always new.
+    scale_refresh : str, optional
+        "generation" (default): r_i of eq. (25) stays the same while a generation is tested.
+        "addition": it is that of all states so far, for each state tested; for meshes of up to
+        some thousand states.
     max_states : int, optional
         Most states, the failure state counted.
     on_generation : callable, optional
@@ -338,6 +350,8 @@ def grow_mesh(
     first = checked_array("initial_state", initial_state, np.float64, (STATE_SIZE,))[np.newaxis]
     _check_finite("initial_state", first)
     threshold = _check_threshold(threshold)
+    if scale_refresh not in SCALE_REFRESHES:
+        raise InputError("scale_refresh", scale_refresh, " or ".join(SCALE_REFRESHES))
     if not (isinstance(max_states, Integral) and 2 <= max_states <= np.iinfo(np.uint32).max):
         raise InputError("max_states", max_states, "a whole number, 2 to 4294967295")
 
@@ -365,7 +379,16 @@ def grow_mesh(
         successors.append(reached)
         slope_indices = _slope_indices(tried)
         scales = _scales(found.states[1:], reached)
-        added, complete = found.extend(reached, clusters_of(slope_indices), scales, threshold)
+        if scale_refresh == "generation":
+            added, complete = found.extend(reached, clusters_of(slope_indices), scales, threshold)
+        else:
+            added, complete = additions(
+                found.states[1:], clusters_of(np.concatenate(preceding)),
+                reached, clusters_of(slope_indices),
+                _spread(reached), threshold, _ROUNDING, max_states - 1,
+            )  # fmt: skip
+            # Known to be new, whatever the scales: none of them lies at a distance of 0.
+            found.extend(reached[added], clusters_of(slope_indices[added]), scales, 0.0)
         if not complete:
             raise MeshLimitError(max_states, len(outcomes), explored - 1, threshold)
         preceding.append(slope_indices[added])

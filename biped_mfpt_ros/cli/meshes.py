@@ -92,6 +92,7 @@ def grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:
         "slopes": len(slopes),
         "threshold": grown.threshold,
         "clustered": grown.clustered,
+        "scale_refresh": args.scale_refresh or "generation",
         "states": len(grown.states),
         "generations": int(grown.generation.max()) + 1,
         "swings": by.swings,

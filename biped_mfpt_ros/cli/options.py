@@ -13,7 +13,9 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.walker.robot import WalkerModel
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG, slope_set
 
-_MODEL_OPTIONS = ("torque_limit", "friction", "slip_duration", "time_limit", "tolerance")
+_MODEL_OPTIONS = (
+    "torque_limit", "friction", "friction_frame", "slip_duration", "time_limit", "tolerance",
+)  # fmt: skip
 
 
 def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -38,7 +40,7 @@ def slopes_of(args: argparse.Namespace) -> np.ndarray:
 
 def mesh_settings(args: argparse.Namespace) -> dict[str, Any]:
     """What `grow_mesh` takes beside slopes and threshold."""
-    return given(args, "max_states") | {"clustered": not args.unclustered}
+    return given(args, "max_states", "scale_refresh") | {"clustered": not args.unclustered}
 
 
 def slope(option: str, degrees: float) -> float:

@@ -124,6 +124,12 @@ def _parents() -> dict[str, Parser]:
         help="coefficient between foot and ground, or none for no slip (default: 0.6)",
     )
     walker.add_argument(
+        "--friction-frame",
+        choices=("slope", "vertical"),
+        help="what friction at impact is judged against: the slope ahead, or level ground "
+        "(default: slope)",
+    )
+    walker.add_argument(
         "--slip-duration",
         type=_number,
         metavar="S",
@@ -178,6 +184,12 @@ def _parents() -> dict[str, Parser]:
         "--unclustered",
         action="store_true",
         help="look for the nearest state among all, not only among those after the same slope",
+    )
+    mesh.add_argument(
+        "--scale-refresh",
+        choices=("generation", "addition"),
+        help="when the scales of the distance between states are computed anew: for each "
+        "generation, or after each state that is added (default: generation)",
     )
     mesh.add_argument(
         "--max-states",

@@ -83,7 +83,11 @@ def _land(rob, work, s, slope, after):
             return _NOT_FINITE
     if not normal > 0.0:
         return _PULLS
-    if not abs(tangential) < rob[r.FRICTION] * normal:
+    if rob[r.VERTICAL_FRICTION] != 0.0:
+        sticks = abs(px) < rob[r.FRICTION] * py
+    else:
+        sticks = abs(tangential) < rob[r.FRICTION] * normal
+    if not sticks:
         return _IMPACT_SLIPS
     if not vy * cosine - vx * sine > 0.0:
         return _NO_LIFT

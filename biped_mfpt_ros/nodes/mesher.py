@@ -253,6 +253,7 @@ class _Growth:
                 settings.threshold,
                 initial_slope=settings.initial_slope,
                 clustered=settings.clustered,
+                scale_refresh=settings.scale_refresh,
                 max_states=settings.max_states,
                 on_generation=self._on_generation,
             )

@@ -20,7 +20,7 @@ from biped_mfpt_msgs.srv import SimulateSteps
 from builtin_interfaces.msg import Time
 
 from biped_mfpt_ros.chain.markov import Metastability
-from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES, Mesh
+from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES, SCALE_REFRESHES, Mesh
 from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.step import Steps, check_states
@@ -117,6 +117,7 @@ def model_message(model: WalkerModel) -> msg.WalkerModel:
         slip_duration=float(model.slip_duration),
         time_limit=float(model.time_limit),
         tolerance=float(model.tolerance),
+        friction_frame=model.friction_frame,
     )
 
 
@@ -129,6 +130,7 @@ def model_from(message: msg.WalkerModel, name: str = "model") -> WalkerModel:
             slip_duration=message.slip_duration,
             time_limit=message.time_limit,
             tolerance=message.tolerance,
+            friction_frame=message.friction_frame or "slope",
         )
 
 
@@ -148,6 +150,8 @@ class MeshSettings:
         d_thr, > 0.
     clustered : bool
         Whether the nearest state is sought among those of the same preceding slope.
+    scale_refresh : str
+        When r_i of eq. (25) is computed anew: "generation" or "addition", see `grow_mesh`.
     max_states : int
         States at which the mesh is given up, 2 to 2^32 - 1.
     initial_state : numpy.ndarray or None
@@ -169,6 +173,7 @@ class MeshSettings:
     max_states: int = DEFAULT_MAX_STATES
     initial_state: np.ndarray | None = None
     initial_slope: float = 0.0
+    scale_refresh: str = "generation"
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -176,6 +181,8 @@ class MeshSettings:
         object.__setattr__(self, "slopes", slopes)
         if not (math.isfinite(self.threshold) and self.threshold > 0.0):
             raise InputError("threshold", self.threshold, "finite, > 0")
+        if self.scale_refresh not in SCALE_REFRESHES:
+            raise InputError("scale_refresh", self.scale_refresh, " or ".join(SCALE_REFRESHES))
         if not 2 <= self.max_states < 2**32:
             raise InputError("max_states", self.max_states, f"2 to {2**32 - 1}")
         if self.initial_state is not None:
@@ -199,6 +206,7 @@ def settings_message(settings: MeshSettings) -> msg.MeshSettings:
         slopes=packed(settings.slopes, "d"),
         threshold=float(settings.threshold),
         clustered=bool(settings.clustered),
+        scale_refresh=settings.scale_refresh,
         max_states=settings.max_states,
         initial_state=packed(initial, "d"),
         initial_slope=float(settings.initial_slope),
@@ -215,6 +223,7 @@ def settings_from(message: msg.MeshSettings, name: str = "settings") -> MeshSett
             slopes=unpacked(message.slopes, "d").copy(),
             threshold=message.threshold,
             clustered=message.clustered,
+            scale_refresh=message.scale_refresh or "generation",
             max_states=message.max_states,
             initial_state=initial.copy() if initial.size else None,
             initial_slope=message.initial_slope,
