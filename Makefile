@@ -6,7 +6,7 @@ ARGS ?=
 # An ordinary ROS 2 that is active in this shell must not leak into .venv, which has its own.
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH
 
-.PHONY: help setup run reproduce test lint clean
+.PHONY: help setup run reproduce test lint bench soak clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -29,6 +29,9 @@ lint: setup ## check style and types
 
 bench: setup ## time step map, mesh and chain; ARGS='--short' or ARGS='--json'
 	@$(BIN)/python -m biped_mfpt_ros.bench $(ARGS)
+
+soak: setup ## break things many times and count what came of it; ARGS='--short', '--only fuzz' or '--json'
+	@$(BIN)/python -m biped_mfpt_ros.soak $(ARGS)
 
 clean: ## remove all that the other targets made, .venv included
 	rm -rf .venv build .pytest_cache .mypy_cache .ruff_cache .hypothesis

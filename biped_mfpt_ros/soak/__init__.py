@@ -1,0 +1,1 @@
+"""Long tests of what the pipeline promises: many faults, many inputs, many meshes."""
