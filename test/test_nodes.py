@@ -118,6 +118,26 @@ def test_simulator_serves_the_step_map(graph, tester, cycle_state):
     )
 
 
+def test_a_request_that_costs_too_much_is_answered_in_part(graph, tester, cycle_state):
+    graph.start(Simulator, max_evaluations=500_000)
+    simulate = tester.simulator()
+    crawling = BASE.parameters.copy()
+    crawling[1] = 1e5  # damping that makes the integrator take tiny steps: 240000 evaluations
+    states = np.tile(cycle_state, (100, 1))
+    asked = request(states, controller=ControllerMsg(scheme="hzd", parameters=crawling.tolist()))
+    response = simulate(asked)
+    assert response.success
+    assert 500_000 <= response.evaluations < 1_000_000
+    done = len(response.outcomes) // len(SLOPES)
+    assert 1 <= done < 10
+    got = messages.steps_from(response, done, len(SLOPES))
+    expected = simulate_steps(
+        messages.controller_from(asked.controller), states[:done], np.zeros(done), SLOPES
+    )
+    assert got.outcomes.tobytes() == expected.outcomes.tobytes()
+    assert got.next_states.tobytes() == expected.next_states.tobytes()
+
+
 NOBODY = np.zeros((1, 10))
 
 

@@ -300,6 +300,39 @@ def test_states_near_a_gait_end_in_an_outcome_on_every_slope(seed, name):
     assert (np.diff(times) <= 0).all()
 
 
+def crawling():
+    """The base controller with so much damping that the integrator takes tiny steps."""
+    parameters = controller("hzd/base").parameters.copy()
+    parameters[1] = 1e5
+    return Controller("crawling", "hzd", parameters)
+
+
+def test_a_crawling_swing_is_given_up():
+    model = WalkerModel(friction=math.inf)
+    crawl = simulate_steps(crawling(), [cycle_state("hzd/base")], [0.0], [-0.3], model)
+    assert crawl.outcomes == Outcome.TIME_LIMIT
+    assert crawl.integrator_steps == 20_000
+    assert crawl.evaluations < 500_000
+
+
+@pytest.mark.parametrize("most", [1, 1000, 10**9])
+def test_no_swing_is_begun_beyond_a_bound_on_evaluations(most):
+    control, states, previous = reachable("hzd/base", 1)
+    whole = simulate_steps(control, states, previous, SLOPES)
+    steps = simulate_steps(control, states, previous, SLOPES, None, most)
+    n = len(steps.outcomes)
+    assert n == {1: 1, 10**9: len(states)}.get(most, n)
+    assert 1 <= n <= len(states)
+    for name in ("outcomes", "durations", "step_lengths", "energies"):
+        assert getattr(steps, name).tobytes() == getattr(whole, name)[:n].tobytes()
+    k = np.count_nonzero(whole.outcomes[:n] == Outcome.STEP)
+    assert steps.next_states.tobytes() == whole.next_states[:k].tobytes()
+    # Only the last one begun may have passed the bound.
+    before = simulate_steps(control, states[: n - 1], previous[: n - 1], SLOPES).evaluations
+    assert before < most
+    assert n == len(states) or steps.evaluations >= most
+
+
 @pytest.mark.parametrize(
     ("change", "field"),
     [

@@ -51,6 +51,8 @@ FOOT_TOLERANCE = 1e-3
 
 _CLEARANCE = 1e-9  # m, rounding of the height of a foot that stands on the ground
 _MOST_STEPS = 20_000  # integrator steps before a swing is given up
+_MOST_EVALUATIONS = 500_000  # the same for evaluations: a swing may crawl without a step accepted
+_UNBOUNDED = 2**62
 _SLIP_SAMPLES = 6  # in an integrator step that may contain a slip
 _LONGEST_STEP = 0.025  # s: the foot moves one way at most within a step, and back
 _TRACE_SAMPLES = 4  # of every integrator step
@@ -182,7 +184,7 @@ def _swing(
             outcomes[todo] = _BODY
     h = first_step
     while failure < 0 and todo > 0:
-        if steps >= _MOST_STEPS or t >= rob[r.TIME_LIMIT]:
+        if steps >= _MOST_STEPS or evaluations >= _MOST_EVALUATIONS or t >= rob[r.TIME_LIMIT]:
             failure = _TIME
             break
         h = min(h, _LONGEST_STEP, rob[r.TIME_LIMIT] - t + 1e-9)
@@ -408,9 +410,24 @@ def _swing(
 
 @kernel
 def _simulate(
-    scheme, rob, par, states, previous, slopes, outcomes, durations, lengths, energies, following
+    scheme,
+    rob,
+    par,
+    states,
+    previous,
+    slopes,
+    most_evaluations,
+    outcomes,
+    durations,
+    lengths,
+    energies,
+    following,
 ):
-    """Simulate a swing from every state; the states after impact are packed into ``following``."""
+    """Simulate a swing from every state; the states after impact are packed into ``following``.
+
+    No swing is begun after ``most_evaluations``. Returns how many states were simulated, how many
+    steps succeeded, integrator steps and evaluations.
+    """
     m = slopes.size
     s = np.zeros((ROWS, SIZE))
     work = np.zeros((dynamics.WORKSPACE_ROWS, 5))
@@ -419,7 +436,11 @@ def _simulate(
     count = 0
     steps = 0
     evaluations = 0
+    done = 0
     for n in range(states.shape[0]):
+        if evaluations >= most_evaluations:
+            break
+        done += 1
         _set_state(s, states[n])
         swing_steps, swing_evaluations, _ = _swing(
             scheme,
@@ -442,7 +463,7 @@ def _simulate(
             if outcomes[n, i] == _STEP:
                 _to_joint(after[i], following[count])
                 count += 1
-    return count, steps, evaluations
+    return done, count, steps, evaluations
 
 
 @kernel
@@ -520,6 +541,7 @@ def simulate_steps(
     previous_slopes: ArrayLike,
     slopes: ArrayLike,
     model: WalkerModel | None = None,
+    most_evaluations: int | None = None,
 ) -> Steps:
     """Simulate one step from every state, for every slope ahead.
 
@@ -535,11 +557,15 @@ def simulate_steps(
         rad, slopes ahead, shape (m,), strictly ascending, negative is downhill.
     model : WalkerModel, optional
         Torque limit, friction and so on.
+    most_evaluations : int, optional
+        Begin no further swing after so many evaluations of the closed loop: a bound on what a
+        controller costs whose swings crawl. The first swing is always simulated.
 
     Returns
     -------
     Steps
-        Outcomes. A fall is a code, never an error.
+        Outcomes; of the first states only, where ``most_evaluations`` cut it short. A fall is a
+        code, never an error.
 
     Raises
     ------
@@ -566,13 +592,14 @@ def simulate_steps(
     durations, lengths, energies = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
     following = np.empty((n * m, STATE_SIZE))
     start = time.perf_counter()
-    count, steps, evaluations = _simulate(
+    done, count, steps, evaluations = _simulate(
         controller.code,
         packed_model,
         packed_controller,
         states,
         previous,
         slopes,
+        _UNBOUNDED if most_evaluations is None else max(1, most_evaluations),
         outcomes,
         durations,
         lengths,
@@ -581,11 +608,11 @@ def simulate_steps(
     )
     seconds = time.perf_counter() - start
     return Steps(
-        outcomes=outcomes,
+        outcomes=outcomes[:done],
         next_states=following[:count].copy(),
-        durations=durations,
-        step_lengths=lengths,
-        energies=energies,
+        durations=durations[:done],
+        step_lengths=lengths[:done],
+        energies=energies[:done],
         seconds=seconds,
         integrator_steps=steps,
         evaluations=evaluations,

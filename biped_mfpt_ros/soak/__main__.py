@@ -17,9 +17,10 @@ from biped_mfpt_ros.report.tables import table
 from biped_mfpt_ros.soak.result import Row
 
 SUBJECTS = ("fuzz",)
-"""Modules of this package. Each has ``run(short, seed, progress)``, which returns a list of `Row`."""
+"""Modules of this package, each with a function `run`."""
 
 Run = Callable[[bool, int, Progress], list[Row]]
+"""Of a subject: whether it is to be short, a seed, and where to tell how far it is."""
 
 
 def main(arguments: list[str] | None = None) -> int:
