@@ -17,6 +17,7 @@ from test_bag import QOS, add_topic, stated_hash
 
 from biped_mfpt_ros.bag import BagError, BagWriter, inspect_bag, read_meshes, salvage
 from biped_mfpt_ros.bag.definitions import message_definition
+from biped_mfpt_ros.bag.metadata import STARTED_LATE
 from biped_mfpt_ros.chain.markov import metastability
 from biped_mfpt_ros.chain.mesh import Mesh, grow_mesh
 from biped_mfpt_ros.control.controller import controller
@@ -95,8 +96,9 @@ class Recording:
             for sequence, message in enumerate(topic):
                 message.sequence = sequence
 
-    def write(self, path: Path, close: bool = True) -> Path:
+    def write(self, path: Path, close: bool = True, **custom: str) -> Path:
         writer = BagWriter(path)
+        writer.custom.update(custom)
         for topic, name in (
             ("mesh/info", "MeshInfo"),
             ("mesh/states", "MeshStates"),
@@ -222,6 +224,24 @@ def test_bag_of_several_meshes(tmp_path, mesh):
     report = inspect_bag(tmp_path / "bag")
     # That a mesh failed is a result; that one never ended is a fault of the recording.
     assert [problem.split(":")[0] for problem in report.problems] == ["mesh cut"]
+
+
+def test_counters_of_a_bag_that_leaves_out_what_was_before_begin_anywhere(tmp_path, mesh):
+    recording = Recording(mesh)
+    for topic in (recording.info, recording.states, recording.transitions, recording.mfpt):
+        for message in topic:
+            message.sequence += 2
+    late = {STARTED_LATE: "yes"}
+    report = inspect_bag(recording.write(tmp_path / "late", **late))
+    assert not report.problems
+    assert report.identical
+    # Of any other bag the counters begin with the publisher.
+    problems = inspect_bag(recording.write(tmp_path / "whole")).problems
+    assert "/run/mesh/info: messages 0 to 1 are missing" in problems
+    assert len(problems) == 4
+    recording.states.pop(3)
+    problems = inspect_bag(recording.write(tmp_path / "lossy", **late)).problems
+    assert "/run/mesh/states: message 5 is missing" in problems
 
 
 SPOILT = {

@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message
 from ros_graph import ros_graph, wait_for
 from rosbags.highlevel import AnyReader
 
-from biped_mfpt_ros.bag import Bag, BagError, salvage
+from biped_mfpt_ros.bag import Bag, BagError, inspect_bag, salvage
 from biped_mfpt_ros.nodes.publishers import CountedPublisher
 from biped_mfpt_ros.nodes.qos import PROGRESS, RESULTS
 
@@ -174,6 +174,29 @@ def test_everything_published_is_in_the_bag(graph, tmp_path):
     for topic, sent in publisher.sent.items():
         assert f"{topic}: received {len(sent)} messages of {len(sent)} published" in log
         assert saved[topic] == len(sent)  # while it was being recorded
+
+
+@pytest.mark.parametrize("earlier", [True, False])
+def test_recorder_may_leave_out_what_was_before(graph, tmp_path, earlier):
+    bag = tmp_path / "bag"
+    publisher = graph.start(Publisher)
+    for _ in range(2):
+        publisher.send("mesh/info", messages.MeshInfo(mesh_id="before"))
+    process = record(graph, bag, "-p", f"earlier:={str(earlier).lower()}")
+    matched = publisher._publishers_by_topic["mesh/info"]._publisher.get_subscription_count
+    wait_for(matched, "the recorder")
+    publisher.send("mesh/info", messages.MeshInfo(mesh_id="mine"))
+    publisher.wait_until_received("mesh/info")
+    code, log = stop(process)
+    assert code == 0, log
+    recorded = [
+        deserialize_message(raw.data, messages.MeshInfo).mesh_id
+        for raw in Bag(bag).raw_messages()
+        if raw.topic == "/run/mesh/info"
+    ]
+    assert recorded == (["before", "before", "mine"] if earlier else ["mine"])
+    # Whoever reads the bag can tell messages that were left out from ones that were lost.
+    assert not any("missing" in problem for problem in inspect_bag(bag).problems)
 
 
 def test_lost_messages_are_errors_in_the_log(graph, tmp_path):

@@ -17,6 +17,9 @@ from biped_mfpt_ros.bag.error import BagError
 
 FILE_NAME = "metadata.yaml"
 VERSION = 9
+STARTED_LATE = "started_late"
+"""Key of `Metadata.custom` in a bag whose recorder was told to leave out what had been published
+before: its counters may begin anywhere."""
 _ROOT = "rosbag2_bagfile_information"
 # rosbag2 gives an empty bag the latest time that it can express.
 _NEVER = 2**63 - 1

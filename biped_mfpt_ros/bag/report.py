@@ -12,6 +12,7 @@ import numpy as np
 from biped_mfpt_ros.bag.error import BagError
 from biped_mfpt_ros.bag.meshes import RecordedMesh, recorded_meshes
 from biped_mfpt_ros.bag.reader import Bag
+from biped_mfpt_ros.bag.metadata import STARTED_LATE
 from biped_mfpt_ros.bag.sequences import SequenceCheck, leading_sequence
 from biped_mfpt_ros.chain.markov import ChainError, metastability
 from biped_mfpt_ros.errors import InputError
@@ -258,12 +259,14 @@ def _survey(
     published: dict[str, _Estimates] = {}
     first = last = 0
     problems: list[str] = []
+    started_late = bag.metadata is not None and STARTED_LATE in bag.metadata.custom
     for raw in bag.raw_messages():
         first = min(first, raw.log_time) if first else raw.log_time
         last = max(last, raw.log_time)
         if not raw.type_name.startswith(_PACKAGE):
             continue
-        check = checks.setdefault(raw.topic, SequenceCheck(complete=raw.type_name != _VOLATILE))
+        complete = raw.type_name != _VOLATILE and not started_late
+        check = checks.setdefault(raw.topic, SequenceCheck(complete=complete))
         try:
             problem = check.add(leading_sequence(raw.data))
         except ValueError as error:

@@ -22,6 +22,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from biped_mfpt_ros.bag.definitions import message_definition
 from biped_mfpt_ros.bag.error import BagWriteError
+from biped_mfpt_ros.bag.metadata import STARTED_LATE
 from biped_mfpt_ros.bag.sequences import SequenceCheck, leading_sequence
 from biped_mfpt_ros.bag.writer import BagWriter
 from biped_mfpt_ros.errors import InputError
@@ -98,6 +99,8 @@ class Recorder(Node):
         self._earlier = parameters.earlier
         self._recordings: list[_Recording] = []
         self._bag = BagWriter(parameters.bag or time.strftime("pipeline_%Y_%m_%d-%H_%M_%S"))
+        if not self._earlier:
+            self._bag.custom[STARTED_LATE] = "messages from before it began were not recorded"
         self.failed = False
         """Whether recording had to be given up."""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
