@@ -11,8 +11,8 @@ import numpy as np
 
 from biped_mfpt_ros.bag.error import BagError
 from biped_mfpt_ros.bag.meshes import RecordedMesh, recorded_meshes
-from biped_mfpt_ros.bag.reader import Bag
 from biped_mfpt_ros.bag.metadata import STARTED_LATE
+from biped_mfpt_ros.bag.reader import Bag
 from biped_mfpt_ros.bag.sequences import SequenceCheck, leading_sequence
 from biped_mfpt_ros.chain.markov import ChainError, metastability
 from biped_mfpt_ros.errors import InputError
