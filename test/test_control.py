@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly
+from scipy.interpolate import BPoly, BSpline
 
-from biped_mfpt_ros.control import hzd, smc
+from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.control.controller import Controller, controller, controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.closed_loop import closed_loop
@@ -20,6 +20,7 @@ from biped_mfpt_ros.walker.robot import ABSOLUTE, WalkerModel, rabbit
 
 HZD_NAMES = [n for n in controller_names() if n.startswith("hzd/")]
 SMC_NAMES = [n for n in controller_names() if n.startswith("smc/")]
+SPLINE_NAMES = [n for n in controller_names() if n.startswith("spline/")]
 FREE = WalkerModel(torque_limit=math.inf)
 RNG = np.random.default_rng(3)
 
@@ -138,6 +139,89 @@ def test_sliding_mode_near_sigma_zero_rests_on_its_slow_manifold():
                 assert smc._law(-sigma, -rate, k, exponent, width) == -value
 
 
+def spline_reference(parameters):
+    """References by scipy: the outer coefficients go on for 20 spacings beyond both ends."""
+    first, last = parameters[8:10]
+    table = parameters[10:].reshape(4, spline.COEFFICIENTS)
+    more = 20
+    coefficients = np.pad(table, ((0, 0), (more, more)), mode="edge").T
+    spacing = (last - first) / (spline.COEFFICIENTS - 1)
+    # The bump of coefficient k spans the knots k to k + 4, with its top at the third of them.
+    knots = first + spacing * (np.arange(len(coefficients) + 4) - more - 2)
+    return BSpline(knots, coefficients, 3, extrapolate=False)
+
+
+@pytest.mark.parametrize("name", SPLINE_NAMES)
+def test_spline_references_are_scipys_and_bounded_beyond_the_step(name):
+    parameters = controller(name).parameters
+    reference = spline_reference(parameters)
+    first, last = parameters[8:10]
+    table = parameters[10:].reshape(4, spline.COEFFICIENTS)
+    span = last - first
+    spacing = span / (spline.COEFFICIENTS - 1)
+    for theta in np.linspace(first - 2 * span, last + 2 * span, 501):
+        expected = np.array([reference.derivative(n)(theta) for n in range(3)])
+        found = spline.references(parameters, theta)
+        # Values up to 4 rad are rounded at 1e-15; the n-th derivative divides by spacing^n.
+        for n in range(3):
+            assert found[n] == pytest.approx(expected[n], abs=1e-14 / spacing**n)
+        assert (table.min(axis=1) - 1e-12 <= found[0]).all()
+        assert (found[0] <= table.max(axis=1) + 1e-12).all()
+    for theta, end in ((first - span, 0), (last + span, -1), (-1e9, 0), (1e9, -1)):
+        value, slope, curvature = spline.references(parameters, theta)
+        assert value == pytest.approx(table[:, end], abs=1e-14)
+        assert not slope.any()
+        assert not curvature.any()
+
+
+@pytest.mark.parametrize("name", SPLINE_NAMES)
+def test_spline_leaves_linear_error_dynamics(name):
+    """ddh_i = -kp_i h_i - kd_i dh_i, off the gait and beyond both ends, references by scipy."""
+    control = controller(name)
+    # Each output with gains of its own.
+    values = control.parameters.copy()
+    values[:8] *= np.linspace(0.5, 2.0, 8)
+    control = Controller("mine", "spline", values)
+    kp, kd = values[:4], values[4:8]
+    reference = spline_reference(values)
+    select = np.array([[0, 1, 0, 0, 1], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1.0]])
+    c = np.array([-1.0, 0.0, -0.5, 0.0, -1.0])
+    outside = 0
+    for state in find_limit_cycle(controller(name)).state + RNG.normal(0, 0.3, (100, 10)):
+        ddq, torques = motion(control, state)
+        q, dq = state[:5], state[5:]
+        theta, rate, acceleration = c @ q, c @ dq, c @ ddq
+        value, first, second = (reference.derivative(n)(theta) for n in range(3))
+        h = select @ q - value
+        dh = select @ dq - first * rate
+        ddh = select @ ddq - second * rate**2 - first * acceleration
+        assert np.allclose(ddh, -kp * h - kd * dh, rtol=1e-9, atol=1e-9 * np.abs(ddq).max())
+        again = dynamics.accelerations(state, torques, rabbit())
+        assert np.allclose(again, ddq, rtol=1e-9, atol=1e-9 * np.abs(ddq).max())
+        outside += not values[8] <= theta <= values[9]
+    assert outside > 20
+
+
+@pytest.mark.parametrize("name", SPLINE_NAMES)
+def test_spline_walks_on_the_flat(name):
+    cycle = find_limit_cycle(controller(name))
+    assert cycle.stable
+    assert cycle.speed > 0.1
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+def test_spline_reference_state_has_both_feet_on_the_ground_and_no_error(rate):
+    """The legs are swapped back; what the impact does to rates is tested with the walker."""
+    parameters = controller("spline/base").parameters
+    state = spline.reference_state(parameters, rate, rabbit())
+    q = hzd.swapped(state[:5])
+    value, _, _ = spline.references(parameters, hzd.phase(q))
+    assert np.array([q[1] + q[4], q[2], q[3], q[4]]) == pytest.approx(value, abs=1e-9)
+    foot = rabbit().swing_foot_position
+    assert foot @ np.cos(ABSOLUTE @ q) == pytest.approx(0.0, abs=1e-9)
+    assert -foot @ np.sin(ABSOLUTE @ q) > 0.2  # ahead, by about a step of this gait
+
+
 def test_torques_are_cut_off_joint_by_joint():
     control = controller("hzd/base")
     state = find_limit_cycle(control).state + 0.2
@@ -159,6 +243,11 @@ def test_torques_are_cut_off_joint_by_joint():
         (lambda: Controller("x", "smc", np.full(18, np.nan)), r"parameters\[0\]"),
         (lambda: Controller("x", "smc", np.zeros(18)).packed(rabbit()), r"parameters\[k1\]"),
         (lambda: Controller("x", "hzd", np.zeros(30)).packed(rabbit()), r"parameters\[kp\]"),
+        (lambda: Controller("x", "spline", np.zeros(42)).packed(rabbit()), r"parameters\[kp_1\]"),
+        (
+            lambda: Controller("x", "spline", np.ones(42)).packed(rabbit()),
+            r"parameters\[theta_last\]",
+        ),
     ],
 )
 def test_parameters_that_are_not_allowed_are_named(build, field):

@@ -10,7 +10,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from biped_mfpt_ros.control.controller import controller, controller_names
+from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.report import paper, pictures
 from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text, rate_text
@@ -174,13 +174,13 @@ class TestTables:
 
 class TestPaper:
     def test_table_5(self):
-        assert [paper.mfpt(name, 0.0, 1.0) for name in controller_names()] == [
+        assert [paper.mfpt(name, 0.0, 1.0) for name in paper_controller_names()] == [
             5.9, 7.3, 113.1, 3.2e5, 2.2, 1.6e14,
         ]  # fmt: skip
 
     def test_tables_2_and_4(self):
         data = json.loads(files("biped_mfpt_ros").joinpath("data/paper.json").read_text())
-        for name in controller_names():
+        for name in paper_controller_names():
             scheme, label = name.split("/")
             sigma, key = {
                 "hzd": (2.0, "table2_hzd_sigma2"),

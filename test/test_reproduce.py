@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from biped_mfpt_ros.cli import main
-from biped_mfpt_ros.control.controller import controller_names
+from biped_mfpt_ros.control.controller import paper_controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.report import html
 from biped_mfpt_ros.report.style import Picture
@@ -89,14 +89,14 @@ def table_of(results, name):
 
 class TestReadings:
     def test_every_controller_has_one_with_a_reason(self):
-        assert tuple(readings()) == controller_names()
+        assert tuple(readings()) == paper_controller_names()
         for reading in readings().values():
             assert len(reading.reason) > 20
             assert len(reading.source) > 5
 
     def test_hzd_walks_with_the_defaults(self):
         # Table 2 was reproduced with them, and the defaults are documented by that.
-        for name in controller_names():
+        for name in paper_controller_names():
             if name.startswith("hzd/"):
                 assert readings()[name].model == WalkerModel()
 
@@ -104,7 +104,7 @@ class TestReadings:
 class TestPlan:
     def test_all_that_the_paper_has_is_planned(self):
         plan = make_plan()
-        assert plan.controllers == controller_names()
+        assert plan.controllers == paper_controller_names()
         assert plan.walks == 10_000
         for name in plan.controllers:
             scheme = scheme_of(name)

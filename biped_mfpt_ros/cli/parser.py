@@ -604,7 +604,7 @@ examples:
     add(
         "controllers",
         "single:controllers",
-        "list the controllers of the paper with its figures",
+        "list the controllers: those of the paper with its figures, and others",
         "",
         "output",
     )

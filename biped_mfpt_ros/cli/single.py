@@ -10,7 +10,7 @@ from biped_mfpt_ros.cli import options
 from biped_mfpt_ros.cli.kernels import work
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.results import monte_carlo_result, shares_table
-from biped_mfpt_ros.control.controller import catalogue
+from biped_mfpt_ros.control.controller import catalogue, origin, paper_controller_names
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo as walk
 from biped_mfpt_ros.gait.step import check_states, simulate_steps
@@ -129,9 +129,11 @@ def monte_carlo(args: argparse.Namespace) -> None:
 
 def controllers(args: argparse.Namespace) -> None:
     """List the catalogue."""
-    rows = [paper.figures(name) for name in catalogue()]
+    papers = paper_controller_names()
+    rows = [paper.figures(name) for name in papers]
+    others = [{"controller": n, "origin": origin(n)} for n in catalogue() if n not in papers]
     if args.json:
-        print(json_text({"controllers": rows}))
+        print(json_text({"controllers": [*rows, *others]}))
         return
     print(
         table(
@@ -149,7 +151,8 @@ def controllers(args: argparse.Namespace) -> None:
             ],
         )
     )
-    print("\nAs the paper gives them; speed in m/s, MFPT and Monte Carlo in steps.")
+    print("\nAs the paper gives them; speed in m/s, MFPT and Monte Carlo in steps. Others:\n")
+    print(table(("controller", "origin"), [(row["controller"], row["origin"]) for row in others]))
 
 
 def _beside(reference: float | None) -> str:

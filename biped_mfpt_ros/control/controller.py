@@ -1,17 +1,18 @@
-"""What a controller is, and the catalogue of the paper's six."""
+"""What a controller is, and the catalogue: the paper's six and others."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 
-from biped_mfpt_ros.control import hzd, smc
+from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.walker.robot import Robot
 
@@ -42,11 +43,12 @@ class Scheme:
     reference_state: Callable[[np.ndarray, float, Robot], np.ndarray]
 
 
-HZD, SMC = 0, 1
+HZD, SMC, SPLINE = 0, 1, 2
 
 SCHEMES = {
     "hzd": Scheme(HZD, hzd.PARAMETERS, 1, hzd.packed, hzd.reference_state),
     "smc": Scheme(SMC, smc.PARAMETERS, 0, smc.packed, smc.reference_state),
+    "spline": Scheme(SPLINE, spline.PARAMETERS, 0, spline.packed, spline.reference_state),
 }
 """Every scheme by its name."""
 
@@ -109,25 +111,57 @@ class Controller:
 
 
 @cache
-def catalogue() -> dict[str, Controller]:
-    """The six controllers of Tables 1 and 3, by name."""
+def _data() -> dict[str, dict[str, dict[str, Any]]]:
+    """Rows of the catalogue by scheme and label."""
     data = json.loads(files("biped_mfpt_ros").joinpath("data/controllers.json").read_text())
-    out = {}
-    for label, row in data["hzd"]["controllers"].items():
-        values: Sequence[float] = [row["kp"], row["kd"], *np.ravel(row["bezier"])]
-        out[f"hzd/{label}"] = Controller(f"hzd/{label}", "hzd", np.array(values))
-    for label, row in data["smc"]["controllers"].items():
-        values = [
-            math.radians(row[f"{name}_deg"]) if f"{name}_deg" in row else row[name]
-            for name in smc.PARAMETERS
-        ]
-        out[f"smc/{label}"] = Controller(f"smc/{label}", "smc", np.array(values))
-    return out
+    return {scheme: data[scheme]["controllers"] for scheme in SCHEMES}
+
+
+_VALUES: dict[str, Callable[[dict[str, Any]], list[float]]] = {
+    "hzd": lambda row: [row["kp"], row["kd"], *np.ravel(row["bezier"])],
+    "smc": lambda row: [
+        math.radians(row[f"{name}_deg"]) if f"{name}_deg" in row else row[name]
+        for name in smc.PARAMETERS
+    ],
+    "spline": lambda row: [
+        *row["kp"],
+        *row["kd"],
+        row["theta_first"],
+        row["theta_last"],
+        *np.ravel(row["coefficients"]),
+    ],
+}
+
+
+@cache
+def catalogue() -> dict[str, Controller]:
+    """Every named controller: the six of Tables 1 and 3, and those with an origin of their own."""
+    return {
+        f"{scheme}/{label}": Controller(f"{scheme}/{label}", scheme, np.array(_VALUES[scheme](row)))
+        for scheme, rows in _data().items()
+        for label, row in rows.items()
+    }
 
 
 def controller_names() -> tuple[str, ...]:
     """Names of the catalogue."""
     return tuple(catalogue())
+
+
+def paper_controller_names() -> tuple[str, ...]:
+    """Names of the six controllers of the paper."""
+    return tuple(
+        f"{scheme}/{label}"
+        for scheme, rows in _data().items()
+        for label, row in rows.items()
+        if "origin" not in row
+    )
+
+
+def origin(name: str) -> str:
+    """Where a controller of the catalogue comes from."""
+    scheme, _, label = controller(name).name.partition("/")
+    return str(_data()[scheme][label].get("origin", "paper"))
 
 
 def controller(name: str) -> Controller:

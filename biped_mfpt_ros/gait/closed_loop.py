@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from biped_mfpt_ros.control import hzd, smc
-from biped_mfpt_ros.control.controller import HZD
+from biped_mfpt_ros.control import hzd, smc, spline
+from biped_mfpt_ros.control.controller import HZD, SMC
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker import robot as r
@@ -34,8 +34,10 @@ def closed_loop(scheme, switched, rob, par, work, y, rate):
     else:
         if scheme == HZD:
             hzd.command(par, work, y)
-        else:
+        elif scheme == SMC:
             smc.command(par, work, y, switched)
+        else:
+            spline.command(par, work, y)
         dynamics.prescribed_motion(rob, work, y)
         tangential, normal = dynamics.row_sum(rob, work, y)
         limit = rob[r.TORQUE_LIMIT]
@@ -69,7 +71,9 @@ def switch(scheme, par, y):
     """Positive before the controller's switch, negative after it."""
     if scheme == HZD:
         return hzd.switch(par, y)
-    return smc.switch(par, y)
+    if scheme == SMC:
+        return smc.switch(par, y)
+    return 1.0
 
 
 @kernel

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from biped_mfpt_ros.control.controller import controller, controller_names
+from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import STEP_MAP
 from biped_mfpt_ros.study.readings import readings
@@ -177,7 +177,7 @@ def make_plan(
     Parameters
     ----------
     controllers : sequence of str, optional
-        Names in the catalogue; all six by default. Their order does not count.
+        Controllers of the paper; all six by default. Their order does not count.
     quick : bool, optional
         Coarser meshes and fewer walks.
     walks : int, optional
@@ -188,11 +188,13 @@ def make_plan(
     Raises
     ------
     InputError
-        If a controller is unknown, or there are no walks.
+        If a controller is none of the paper's, or there are no walks.
     """
+    papers = paper_controller_names()
     for name in controllers or ():
-        controller(name)
-    names = tuple(n for n in controller_names() if not controllers or n in controllers)
+        if name not in papers:
+            raise InputError("controller", name, "one of " + ", ".join(papers))
+    names = tuple(n for n in papers if not controllers or n in controllers)
     walks = (QUICK_WALKS if quick else WALKS) if walks is None else walks
     if walks < 2:
         raise InputError("walks", walks, ">= 2")

@@ -1,0 +1,215 @@
+"""B-spline references over the phase, with PD control: the paper's own conclusion (section 7).
+
+The outputs of the sliding-mode scheme, the absolute angle of the swing femur theta_2 = q2 + q5, the
+knees q3 and q4 and the torso q5 (eq. 14), follow cubic B-splines of the phase variable of hybrid
+zero dynamics, ``theta = c q = -(a_1 + a_3) / 2``, with computed torques that leave
+``ddh_i = -kp_i h_i - kd_i dh_i``.
+
+A reference is ``sum_k c_k B((theta - theta_k) / spacing)`` with one bump B of the uniform cubic
+B-spline on each of `COEFFICIENTS` equally spaced phases, from theta_first to theta_last. Beyond
+both ends the first and the last coefficient go on for ever. So a reference
+
+- is defined for every phase, and constant from one spacing beyond either end on,
+- never leaves the range of its coefficients, as the bumps are positive and sum to one,
+- has two continuous derivatives everywhere,
+
+where a Bezier polynomial, made for 0 <= tau <= 1, runs away outside of it. As references and phase
+are absolute, no hybrid invariance is asked for: after each impact the outputs converge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.walker.dynamics import ALPHA, BETA, swing_foot
+from biped_mfpt_ros.walker.impact import impact_map
+from biped_mfpt_ros.walker.robot import Robot, WalkerModel
+
+COEFFICIENTS = 8
+"""Of each output's reference."""
+
+PARAMETERS = (
+    *(f"kp_{i}" for i in range(1, 5)),
+    *(f"kd_{i}" for i in range(1, 5)),
+    "theta_first",
+    "theta_last",
+    *(f"c_{k}^{i}" for i in range(1, 5) for k in range(COEFFICIENTS)),
+)
+"""Names of the parameters, in order: gains (1/s^2, 1/s), phases of the first and the last
+coefficient (rad), then the coefficients (rad) of theta_2, q3, q4 and q5."""
+
+_GAINS, _FIRST, _LAST, _TABLE = 8, 8, 9, 10  # offsets into the parameters
+
+# The references are kept piece by piece, as polynomials of the fraction of the spacing, from one
+# spacing before theta_first to one after theta_last, and a constant piece for what comes then.
+_PIECES = COEFFICIENTS + 2
+# Offsets into the packed parameters: gains, phase where the pieces begin, 1 / spacing, polynomials.
+_KP, _KD, _START, _INVERSE, _PIECE = 0, 4, 8, 9, 10
+PACKED_SIZE = _PIECE + _PIECES * 16
+
+# Rows: four successive coefficients; columns: powers of the fraction of the spacing.
+_BASIS = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
+
+
+@kernel
+def command(par, work, y):
+    """Accelerations ``alpha + beta z`` with ``z = ddtheta``, into the workspace."""
+    theta = -0.5 * (y[0] + y[2])
+    rate = -0.5 * (y[5] + y[7])
+    at = (theta - par[_START]) * par[_INVERSE]
+    if not at > 0.0:  # also where it is not a number
+        at = 0.0
+    elif at > _PIECES - 1.0:
+        at = _PIECES - 1.0
+    piece = int(at)
+    at -= piece
+    for i in range(4):
+        k = _PIECE + 16 * piece + 4 * i
+        a1, a2, a3 = par[k + 1], par[k + 2], par[k + 3]
+        reference = par[k] + at * (a1 + at * (a2 + at * a3))
+        first = (a1 + at * (2.0 * a2 + 3.0 * at * a3)) * par[_INVERSE]
+        second = (2.0 * a2 + 6.0 * at * a3) * par[_INVERSE] * par[_INVERSE]
+        if i == 0:
+            value, value_rate = y[1], y[6]
+        elif i == 1:
+            value, value_rate = y[2] - y[0], y[7] - y[5]
+        elif i == 2:
+            value, value_rate = y[3] - y[1], y[8] - y[6]
+        else:
+            value, value_rate = y[4], y[9]
+        alpha = (
+            second * rate * rate
+            - par[_KP + i] * (value - reference)
+            - par[_KD + i] * (value_rate - first * rate)
+        )
+        # a_1 = -theta - q3 / 2 and a_3 = -theta + q3 / 2.
+        if i == 0:
+            work[ALPHA, 1], work[BETA, 1] = alpha, first
+        elif i == 1:
+            work[ALPHA, 0], work[BETA, 0] = -0.5 * alpha, -1.0 - 0.5 * first
+            work[ALPHA, 2], work[BETA, 2] = 0.5 * alpha, -1.0 + 0.5 * first
+        elif i == 2:
+            work[ALPHA, 3] = work[ALPHA, 1] + alpha
+            work[BETA, 3] = work[BETA, 1] + first
+        else:
+            work[ALPHA, 4], work[BETA, 4] = alpha, first
+
+
+def references(parameters: np.ndarray, theta: float) -> np.ndarray:
+    """References of the outputs and their derivatives with respect to the phase.
+
+    Parameters
+    ----------
+    parameters : numpy.ndarray
+        As `PARAMETERS`.
+    theta : float
+        Phase, rad.
+
+    Returns
+    -------
+    numpy.ndarray
+        Value (rad), first (1) and second derivative (1/rad) of theta_2, q3, q4, q5; shape (3, 4).
+    """
+    first, last = parameters[[_FIRST, _LAST]]
+    spacing = (last - first) / (COEFFICIENTS - 1)
+    at = min(max((theta - first) / spacing + 1.0, 0.0), _PIECES - 1.0)
+    piece = int(at)
+    power = at - piece
+    polynomials = _polynomials(parameters)[piece]
+    return np.array(
+        [
+            polynomials @ [1.0, power, power**2, power**3],
+            polynomials @ [0.0, 1.0, 2.0 * power, 3.0 * power**2] / spacing,
+            polynomials @ [0.0, 0.0, 2.0, 6.0 * power] / spacing**2,
+        ]
+    )
+
+
+def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.ndarray:
+    """State just after an impact on flat ground, without tracking error just before it.
+
+    Parameters
+    ----------
+    parameters : numpy.ndarray
+        As `PARAMETERS`.
+    rate : float
+        dtheta just before the impact, rad/s.
+    robot : Robot
+        The links.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``[q, dq]``, rad and rad/s, shape (10,).
+    """
+    model = WalkerModel(robot=robot).packed()
+
+    def angles(theta: float) -> np.ndarray:
+        theta2, q3, q4, q5 = references(parameters, theta)[0]
+        theta1 = -theta - 0.5 * q3
+        return np.array([theta1, theta2, theta1 + q3, theta2 + q4, q5])
+
+    def height(theta: float) -> float:
+        return swing_foot(model, np.append(angles(theta), np.zeros(5)))[1]
+
+    # The last phase at which the swing foot comes down, else the one where it is lowest.
+    first, last = parameters[[_FIRST, _LAST]]
+    phases = np.linspace(0.5 * (first + last), 2.0 * last - first, 100)
+    heights = np.array([height(theta) for theta in phases])
+    down = np.flatnonzero((heights[:-1] > 0.0) & (heights[1:] <= 0.0))
+    theta = float(phases[np.argmin(heights)])
+    if down.size:
+        low, high = phases[down[-1]], phases[down[-1] + 1]
+        while high - low > 1e-12:
+            theta = 0.5 * (low + high)
+            low, high = (theta, high) if height(theta) > 0.0 else (low, theta)
+    a = angles(theta)
+    d2, d3, d4, d5 = references(parameters, theta)[1] * rate
+    d1 = -rate - 0.5 * d3
+    q = np.array([a[0] - a[4], a[1] - a[4], a[2] - a[0], a[3] - a[1], a[4]])
+    return impact_map(np.concatenate([q, [d1 - d5, d2 - d5, d3, d4, d5]]), robot)[0]
+
+
+def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
+    """Parameters as the kernels read them.
+
+    Parameters
+    ----------
+    parameters : numpy.ndarray
+        As `PARAMETERS`.
+    robot : Robot
+        Not needed; every scheme is packed alike.
+
+    Returns
+    -------
+    numpy.ndarray
+        float64, shape (PACKED_SIZE,).
+
+    Raises
+    ------
+    InputError
+        If a gain is not positive or the phases do not ascend.
+    """
+    for name, value in zip(PARAMETERS[:_GAINS], parameters[:_GAINS], strict=True):
+        if value <= 0.0:
+            raise InputError(f"parameters[{name}]", float(value), "> 0")
+    first, last = parameters[[_FIRST, _LAST]]
+    if not last - first > 1e-3:
+        raise InputError("parameters[theta_last]", float(last), f"above theta_first, {first:g} rad")
+    spacing = (last - first) / (COEFFICIENTS - 1)
+    out = np.empty(PACKED_SIZE)
+    out[_KP : _KP + 4] = parameters[:4]
+    out[_KD : _KD + 4] = parameters[4:8]
+    out[_START] = first - spacing
+    out[_INVERSE] = 1.0 / spacing
+    out[_PIECE:] = _polynomials(parameters).ravel()
+    return out
+
+
+def _polynomials(parameters: np.ndarray) -> np.ndarray:
+    """Polynomials of the references, piece by piece, shape (_PIECES, 4, 4): output, power."""
+    table = parameters[_TABLE:].reshape(4, COEFFICIENTS)
+    window = np.arange(_PIECES)[:, None] + np.arange(-2, 2)
+    return np.einsum("ipk,kn->pin", table[:, np.clip(window, 0, COEFFICIENTS - 1)], _BASIS)
