@@ -140,10 +140,10 @@ def test_sliding_mode_near_sigma_zero_rests_on_its_slow_manifold():
 
 
 def spline_reference(parameters):
-    """References by scipy: the outer coefficients go on for 20 spacings beyond both ends."""
+    """References by scipy: the outer coefficients go on for 100 spacings beyond both ends."""
     first, last = parameters[8:10]
     table = parameters[10:].reshape(4, spline.COEFFICIENTS)
-    more = 20
+    more = 100
     coefficients = np.pad(table, ((0, 0), (more, more)), mode="edge").T
     spacing = (last - first) / (spline.COEFFICIENTS - 1)
     # The bump of coefficient k spans the knots k to k + 4, with its top at the third of them.
