@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from biped_mfpt_msgs.srv import SimulateSteps
 
+from biped_mfpt_ros.chain.mesh import MeshLimitError
 from biped_mfpt_ros.gait.step import Steps
-from biped_mfpt_ros.nodes.fan_out import FanOut, FanOutSettings, NoSimulatorError
+from biped_mfpt_ros.nodes.fan_out import FanOut, FanOutSettings, Job, NoSimulatorError
 from biped_mfpt_ros.nodes.messages import fill_response, packed, unpacked
 
 SLOPES = np.linspace(-0.2, 0.2, 7)
@@ -107,15 +108,53 @@ def swings():
     return rng.normal(size=(300, 10)), rng.choice(SLOPES, 300)
 
 
-def fan_out(fake, settings=QUICK, log=None, tick=lambda: None):
-    request = SimulateSteps.Request(step_map="this", slopes=packed(SLOPES, "d"))
-    return FanOut(fake, request, settings, [].append if log is None else log.append, tick)
+class Swings:
+    """Swings that are all there from the beginning, with what `FanOut` needs of a growth."""
+
+    def __init__(self, states, previous):
+        self.given = states, previous
+        self.known = len(states) + 1
+        self.answers = {}
+
+    def states(self, start, stop):
+        return tuple(array[start - 1 : stop - 1] for array in self.given)
+
+    def take(self, start, steps, n):
+        assert start not in self.answers
+        assert len(steps.outcomes) == n
+        self.answers[start] = steps
+
+    def check(self):
+        """All answers are there, and right to the last bit."""
+        outcomes, following = step_map(*self.given)
+        in_order = [self.answers[start] for start in sorted(self.answers)]
+        assert b"".join(steps.outcomes.tobytes() for steps in in_order) == outcomes.tobytes()
+        assert b"".join(steps.next_states.tobytes() for steps in in_order) == following.tobytes()
 
 
-def check(answers, swings):
-    outcomes, following = step_map(*swings)
-    assert answers.outcomes.tobytes() == outcomes.tobytes()
-    assert answers.next_states.tobytes() == following.tobytes()
+def fan_out(fake, settings=QUICK, log=None):
+    return FanOut(fake, settings, [].append if log is None else log.append)
+
+
+def job_of(swings):
+    return Job(Swings(*swings), SimulateSteps.Request(step_map="this", slopes=packed(SLOPES, "d")))
+
+
+def run(fan_out, *jobs):
+    """Run jobs to their ends, and check what comes out."""
+    for job in jobs:
+        fan_out.add(job)
+    deadline = time.monotonic() + 30.0
+    while any(job.frontier for job in jobs):
+        fan_out.step(0.05)
+        assert time.monotonic() < deadline
+        for job in jobs:
+            if job.error is not None:
+                raise job.error
+    for job in jobs:
+        fan_out.remove(job)
+        job.growth.check()
+    return jobs[0].tally
 
 
 @pytest.mark.parametrize("simulators", [1, 2, 5])
@@ -125,14 +164,46 @@ def test_all_simulators_are_used_and_answers_are_in_order(swings, simulators):
         **{f"s{i}": lambda *a: good(*a, delay=rng.uniform(0, 0.01)) for i in range(simulators)}
     )
     simulate = fan_out(fake)
-    check(simulate(*swings), swings)
-    check(simulate(swings[0][:1], swings[1][:1]), (swings[0][:1], swings[1][:1]))
+    tally = run(simulate, job_of(swings))
     assert all(fake.asked.values())
-    assert simulate.tally.swings == 301
-    assert simulate.tally.chunks_repeated == 0
-    assert simulate.tally.chunks == sum(fake.asked.values())
-    assert simulate.tally.step_map_seconds == pytest.approx(301e-4)
-    assert simulate.in_flight == 0
+    assert tally.swings == 300
+    assert tally.chunks_repeated == 0
+    assert tally.chunks == sum(fake.asked.values())
+    assert tally.step_map_seconds == pytest.approx(300e-4)
+    assert simulate.in_flight() == 0
+
+
+def test_jobs_share_the_simulators_and_end_side_by_side(swings):
+    """A short one that comes while long ones run does not wait for them to end."""
+    fake = Fake(a=good, b=good)
+    simulate = fan_out(fake)
+    long = [job_of(swings), job_of(swings)]
+    short = job_of((swings[0][:20], swings[1][:20]))
+    for job in long:
+        simulate.add(job)
+    simulate.step(0.05)
+    simulate.add(short)
+    while short.frontier:
+        simulate.step(0.05)
+    assert [job.tally.swings < 100 for job in long] == [True, True]
+    assert abs(long[0].tally.swings - long[1].tally.swings) < 60
+    for job in (short, *long):
+        simulate.remove(job)
+    assert simulate.in_flight() == 0
+
+
+def test_a_job_that_fails_leaves_the_others_alone(swings):
+    bad, good_one = job_of(swings), job_of(swings)
+
+    def fail(start, steps, n):
+        raise MeshLimitError(2, 1, 1, 0.1)
+
+    bad.growth.take = fail
+    simulate = fan_out(Fake(a=good))
+    simulate.add(bad)
+    run(simulate, good_one)
+    assert isinstance(bad.error, MeshLimitError)
+    assert bad.tally.chunks < 6
 
 
 @pytest.mark.parametrize(
@@ -151,16 +222,16 @@ def test_one_bad_simulator_beside_a_good_one(swings, way, dropped, said):
     log = []
     fake = Fake(bad=way, good=good)
     simulate = fan_out(fake, log=log)
-    check(simulate(*swings), swings)
+    tally = run(simulate, job_of(swings))
     assert fake.asked["bad"]
     assert (fake.dropped.keys() == {"bad"}) == dropped
     assert said in "".join(log)
     if dropped:
         asked = fake.asked["bad"]
-        check(simulate(*swings), swings)
+        run(simulate, job_of(swings))
         assert fake.asked["bad"] == asked
-    assert simulate.tally.swings == 300 * (1 + dropped)
-    assert (simulate.tally.chunks_repeated > 0) == (way is not twice)
+    assert tally.swings == 300
+    assert (tally.chunks_repeated > 0) == (way is not twice)
 
 
 def test_a_simulator_that_goes_is_replaced_by_one_that_comes(swings):
@@ -174,8 +245,7 @@ def test_a_simulator_that_goes_is_replaced_by_one_that_comes(swings):
     later(0.05, exchange)
     log = []
     simulate = fan_out(fake, log=log, settings=FanOutSettings(timeout=10.0, wait_seconds=1.0))
-    check(simulate(*swings), swings)
-    assert simulate.tally.chunks_repeated > 0
+    assert run(simulate, job_of(swings)).chunks_repeated > 0
     assert "first has gone with" in log[0]
 
 
@@ -193,11 +263,10 @@ def test_a_late_simulator_is_used_again_once_it_answers(swings):
     fake = Fake(stopped=stopped, slow=slow)
     simulate = fan_out(fake, log=log)
     for _ in range(4):
-        check(simulate(*swings), swings)
+        assert run(simulate, job_of(swings)).swings == 300
     assert "stopped answers again" in log
     # Many more than it was tried with while it was late.
     assert fake.asked["stopped"] > 20
-    assert simulate.tally.swings == 4 * 300
 
 
 def test_a_lost_request_is_sent_again_even_to_the_only_simulator(swings):
@@ -210,42 +279,50 @@ def test_a_lost_request_is_sent_again_even_to_the_only_simulator(swings):
             good(fake, request, answer)
 
     simulate = fan_out(Fake(only=loses_first), settings=FanOutSettings(timeout=0.1))
-    check(simulate(*swings), swings)
+    run(simulate, job_of(swings))
 
 
 def test_no_simulator_is_an_error_that_says_so(swings):
     with pytest.raises(NoSimulatorError, match="none on the graph; start one with"):
-        fan_out(Fake())(*swings)
+        run(fan_out(Fake()), job_of(swings))
 
 
 def test_no_good_simulator_is_an_error_that_says_why(swings):
     fake = Fake(bad=partial(spoiled, other_version), mute=silent)
     with pytest.raises(NoSimulatorError, match="mute is late; bad, dropped, runs step map another"):
-        fan_out(fake)(*swings)
+        run(fan_out(fake), job_of(swings))
 
 
 def test_a_simulator_may_come_within_the_wait(swings):
     fake = Fake()
     fake.asked["late"] = 0
     later(0.3, lambda: fake.ways.update(late=good))
-    check(fan_out(fake)(*swings), swings)
+    run(fan_out(fake), job_of(swings))
 
 
-def test_tick_ends_it_promptly(swings):
-    start = time.monotonic()
+def test_waiting_for_a_simulator_is_said_and_goes_on_when_one_comes_back(swings, monkeypatch):
+    monkeypatch.setattr("biped_mfpt_ros.nodes.fan_out._QUIET", 0.1)
+    log = []
+    fake = Fake()
+    fake.asked["back"] = 0
+    later(0.4, lambda: fake.ways.update(back=good))
+    run(fan_out(fake, FanOutSettings(wait_seconds=60.0), log), job_of(swings))
+    assert "no simulator answers: waiting for one, for 60 s" in log[0]
+    assert log[1] == "there is a simulator again: going on"
 
-    def tick():
-        if time.monotonic() - start > 0.1:
-            raise InterruptedError
 
+def test_a_job_is_removed_promptly_and_wake_ends_the_wait(swings):
     forgotten = []
     fake = Fake(mute=silent)
     fake.ask = lambda name, request, answer: partial(forgotten.append, request)
-    simulate = fan_out(fake, settings=FanOutSettings(), tick=tick)
-    with pytest.raises(InterruptedError):
-        simulate(*swings)
-    assert time.monotonic() - start < 0.3
-    assert simulate.in_flight == FanOutSettings().in_flight
-    simulate.close()
+    simulate = fan_out(fake, settings=FanOutSettings())
+    job = job_of(swings)
+    simulate.add(job)
+    later(0.05, simulate.wake)
+    start = time.monotonic()
+    simulate.step(10.0)
+    assert time.monotonic() - start < 1.0
+    assert simulate.in_flight() == simulate.in_flight(job) == FanOutSettings().in_flight
+    simulate.remove(job)
     assert len(forgotten) == FanOutSettings().in_flight
-    assert simulate.in_flight == 0
+    assert simulate.in_flight() == 0

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from biped_mfpt_ros.chain.markov import metastability, slope_probabilities
-from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh, MeshLimitError, grow_mesh
+from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh, MeshGrowth, MeshLimitError, grow_mesh
 from biped_mfpt_ros.errors import InputError
 
 SLOPES = np.radians(np.arange(-10, 11) * 2.0)
@@ -105,6 +105,23 @@ def mesh(request):
     return grow_mesh(Toy(), START, SLOPES, 0.05, clustered=request.param)
 
 
+def grow_in_pieces(simulate, threshold, clustered, rng):
+    """Chunks of random sizes, several in flight, answered in random order."""
+    growth = MeshGrowth(START, SLOPES, threshold, clustered=clustered)
+    handed_out, asked, ahead = 1, [], 0
+    while not growth.complete:
+        while handed_out < growth.known and len(asked) < 7:
+            stop = min(growth.known, handed_out + int(rng.integers(1, 12)))
+            asked.append((handed_out, stop))
+            handed_out = stop
+        start, stop = asked.pop(int(rng.integers(len(asked))))
+        growth.take(start, simulate(*growth.states(start, stop)), stop - start)
+        ahead = max(ahead, stop - growth.tested)
+    assert not asked
+    assert handed_out == growth.known == growth.tested
+    return growth.mesh(), ahead
+
+
 # What a mesh must be ----------------------------------------------------------------------------
 
 
@@ -123,6 +140,32 @@ def test_mesh_is_that_of_the_plain_algorithm(clustered, threshold, scale_refresh
     assert mesh.generation[1:].tolist() == generations
     # Sums of the same numbers, in another order.
     assert mesh.scales == pytest.approx(r, rel=1e-12)
+
+
+@pytest.mark.parametrize("clustered", [True, False])
+@pytest.mark.parametrize("threshold", [0.02, 0.3])
+def test_mesh_is_the_same_whatever_the_pieces_and_the_order_of_answers(clustered, threshold):
+    whole = grow_mesh(Toy(), START, SLOPES, threshold, clustered=clustered)
+    for seed in range(20):
+        mesh, ahead = grow_in_pieces(Toy(), threshold, clustered, np.random.default_rng(seed))
+        assert same_mesh(mesh, whole)
+        assert ahead > 0  # answers did overtake one another
+
+
+def test_the_next_generation_is_known_before_this_one_is_answered():
+    growth = MeshGrowth(START, SLOPES, 0.02)
+    toy = Toy()
+    while growth.generations < 4:
+        start, stop = growth.tested, growth.known
+        growth.take(start, toy(*growth.states(start, stop)), stop - start)
+    start, known = growth.tested, growth.known
+    assert known - start > 4
+    growth.take(start, toy(*growth.states(start, start + 2)), 2)
+    assert (growth.generations, growth.tested) == (4, start + 2)
+    assert growth.known > known
+    # Its own answers wait for the scales, and so for the rest of this one.
+    growth.take(known, toy(*growth.states(known, growth.known)), growth.known - known)
+    assert growth.tested == start + 2
 
 
 def test_failure_state_comes_first(mesh):

@@ -24,7 +24,8 @@ from biped_mfpt_ros.gait.step import simulate_steps
 from biped_mfpt_ros.jit import STEP_MAP
 from biped_mfpt_ros.nodes import messages
 from biped_mfpt_ros.nodes.analysis import Analysis
-from biped_mfpt_ros.nodes.mesher import Mesher, new_mesh_id
+from biped_mfpt_ros.nodes.mesher import Mesher
+from biped_mfpt_ros.nodes.meshes import new_mesh_id
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed
 from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters, parameter
 from biped_mfpt_ros.nodes.qos import PROGRESS, RESULTS
@@ -409,7 +410,7 @@ def test_mesh_beside_a_bad_simulator(graph, tester, mesh_here, answer, said):
 
 
 def test_cancel_is_prompt_and_goals_wait_their_turn(graph, tester):
-    mesher = graph.start(Mesher, simulator_wait_seconds=100.0, max_queued=2)
+    mesher = graph.start(Mesher, simulator_wait_seconds=100.0, max_queued=2, meshes_at_once=1)
     first = tester.send_goal(settings())
     second = tester.send_goal(settings(threshold=3.0))
     third = tester.send_goal(settings())
@@ -433,6 +434,37 @@ def test_cancel_is_prompt_and_goals_wait_their_turn(graph, tester):
     ]  # fmt: skip
     assert [info.sequence for info in tester.infos] == [0, 1, 2, 3]
     assert mesher.get_parameter("max_queued").value == 2
+
+
+def test_several_meshes_grow_at_once_and_each_is_the_one_grown_here(graph, tester, cycle_state):
+    """Of several controllers; an endless one, a bad one and a cancelled one harm no other."""
+    graph.start(Simulator)
+    graph.start(Simulator)
+    graph.start(Mesher, meshes_at_once=4, progress_period=0.05)
+    other = controller("hzd/mfpt")
+    wanted = [
+        settings(),
+        settings(controller=other, clustered=False),
+        settings(threshold=0.1),
+        settings(controller=other, threshold=1.0),
+        settings(threshold=3.0, initial_state=cycle_state),
+        settings(threshold=0.5, slopes=slope_set(1.0)),
+    ]
+    long = tester.send_goal(settings(threshold=1e-4))
+    bad = tester.send_goal(settings(max_states=20))
+    handles = [tester.send_goal(one) for one in wanted]
+    status, result = tester.outcome(bad)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "max_states = 20" in result.message
+    for one, handle in zip(wanted, handles, strict=True):
+        status, result = tester.outcome(handle)
+        assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+        mesh = tester.mesh(result.mesh_id)
+        assert_same_mesh(mesh, grown_here(one, find_limit_cycle(one.controller).state))
+        assert result.swings == result.states - 1
+    assert long.status in (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING)
+    long.cancel_goal_async()
+    assert tester.outcome(long, timeout=5.0)[0] == GoalStatus.STATUS_CANCELED
 
 
 def test_closing_a_mesher_that_grows_a_mesh(graph, tester):
@@ -584,7 +616,10 @@ class TestBadQuestions:
         ("bad", "names"),
         [
             (ask("none"), ("mesh_id", "'none'", "a complete mesh: good")),
-            (ask("gap"), ("mesh_id", "'gap'", "mesh/states: message 2 came, where 1 was due")),
+            (
+                ask("gap"),
+                ("mesh_id", "'gap'", "the next state was to have index 2, not "),
+            ),
             (ask("failed"), ("mesh_id", "'failed'", "it failed: because")),
             (ask("open"), ("mesh_id", "'open'", "it is not finished")),
             (ask("unended"), ("mesh_id", "the transitions of 1 (x_1 counted); messages were lost")),

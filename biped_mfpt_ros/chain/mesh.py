@@ -26,7 +26,7 @@ targets of eq. (27).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any, Protocol
@@ -136,6 +136,12 @@ def _check_threshold(threshold: float) -> float:
     if not (isinstance(threshold, Real) and math.isfinite(threshold) and threshold > 0.0):
         raise InputError("threshold", threshold, "a finite number above 0")
     return float(threshold)
+
+
+def _check_max_states(max_states: object) -> int:
+    if not (isinstance(max_states, Integral) and 2 <= int(max_states) <= np.iinfo(np.uint32).max):
+        raise InputError("max_states", max_states, "a whole number, 2 to 4294967295")
+    return int(max_states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,6 +296,212 @@ def _check_steps(steps: Steps, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     return outcomes, successors
 
 
+class MeshGrowth:
+    """A mesh that grows as answers come, in any order and in pieces of any size.
+
+    States have indices in the order in which they were found: 0 is the failure state, 1 is x_2.
+    Those up to `known` can be simulated at any time. Each answer is tested as soon as all states
+    before it have been, and what it adds is known at once: so the states of the next generation
+    can be simulated before the tests of this one are through. Only their own tests have to wait,
+    for the scales r_i. (The tests of a generation wait for all its answers where a dimension has
+    no spread yet, and with ``scale_refresh="addition"``.)
+
+    Parameters
+    ----------
+    initial_state, slopes, threshold, initial_slope, clustered, scale_refresh, max_states
+        As for `grow_mesh`.
+
+    Raises
+    ------
+    InputError
+        If an argument is not allowed.
+    """
+
+    def __init__(
+        self,
+        initial_state: ArrayLike,
+        slopes: ArrayLike,
+        threshold: float,
+        *,
+        initial_slope: float = 0.0,
+        clustered: bool = True,
+        scale_refresh: str = "generation",
+        max_states: int = DEFAULT_MAX_STATES,
+    ) -> None:
+        self._slopes = check_slopes(slopes)
+        first = checked_array("initial_state", initial_state, np.float64, (STATE_SIZE,))
+        _check_finite("initial_state", first)
+        self._threshold = _check_threshold(threshold)
+        if scale_refresh not in SCALE_REFRESHES:
+            raise InputError("scale_refresh", scale_refresh, " or ".join(SCALE_REFRESHES))
+        self._each_addition = scale_refresh == "addition"
+        self._max_states = _check_max_states(max_states)
+        self._clustered = clustered
+        m = len(self._slopes)
+        slope_index = np.array([_slope_index(self._slopes, initial_slope, "initial_slope")])
+        self._preceding = np.concatenate([[0], slope_index]).astype(np.uint32)
+        self._found = StateSet(m if clustered else 1, self._max_states)
+        self._found.extend(
+            first[np.newaxis], self._clusters(self._preceding[1:]), np.ones(STATE_SIZE), threshold
+        )
+        self._answers: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._answered = 0
+        self._tested = 1
+        self._starts = [1, 2]
+        self._scales: np.ndarray | None = None
+
+    @property
+    def known(self) -> int:
+        """Number of states so far, the failure state counted."""
+        return len(self._found)
+
+    @property
+    def tested(self) -> int:
+        """Number of states of which all successors have been tested, the failure state counted."""
+        return self._tested
+
+    @property
+    def generations(self) -> int:
+        """Number of generations of which all states are known; x_2 is the first."""
+        return len(self._starts) - 1
+
+    @property
+    def complete(self) -> bool:
+        """Whether all states have been tested."""
+        return self._tested == self.known
+
+    def generation(self, number: int) -> tuple[int, np.ndarray, np.ndarray]:
+        """A generation of which all states are known: index of the first, and as `states`."""
+        start, stop = self._starts[number : number + 2]
+        return start, self._found.states[start:stop].copy(), self._preceding[start:stop].copy()
+
+    def states(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        """States to simulate, shape (n, 10), and the slopes behind them in rad, shape (n,)."""
+        return (
+            self._found.states[start:stop].copy(),
+            self._slopes[self._preceding[start:stop]],
+        )
+
+    def take(self, start: int, steps: Steps, n: int) -> None:
+        """Take the answer for n states from index ``start`` on, none of which had one before.
+
+        Raises
+        ------
+        InputError
+            If the answer is not allowed.
+        MeshLimitError
+            If the mesh would hold more than ``max_states`` states.
+        """
+        outcomes, successors = _check_steps(steps, n, len(self._slopes))
+        # A piece belongs to one generation, as far as that is known.
+        end = self._starts[-1]
+        if start < end < start + n:
+            reached = int(np.count_nonzero(outcomes[: end - start] == Outcome.STEP))
+            self._answers[start] = outcomes[: end - start], successors[:reached]
+            start, outcomes, successors = end, outcomes[end - start :], successors[reached:]
+        self._answers[start] = outcomes, successors
+        self._answered += n
+        self._advance()
+
+    def _clusters(self, slope_indices: np.ndarray) -> np.ndarray:
+        return slope_indices if self._clustered else np.zeros_like(slope_indices)
+
+    def _advance(self) -> None:
+        """Test all answers that can be tested."""
+        while True:
+            end = self._starts[-1]
+            if self._tested == end:
+                if self.known == end:
+                    return
+                self._starts.append(self.known)
+                self._scales = None
+                continue
+            if self._scales is None and not self._refresh(end):
+                return
+            if self._each_addition:
+                tried, reached = zip(*self._pieces(self._tested, end), strict=True)
+                self._test(np.concatenate(tried), np.concatenate(reached))
+            elif self._tested in self._answers:
+                self._test(*self._answers[self._tested])
+            else:
+                return
+
+    def _refresh(self, end: int) -> bool:
+        """Refresh the scales at the start of a generation; False if answers are missing for it."""
+        states = self._found.states[1:end]
+        reached = np.empty((0, STATE_SIZE))
+        if self._each_addition or not _spread(states).all():
+            if self._answered < end - 1:
+                return False
+            reached = np.concatenate([piece[1] for piece in self._pieces(self._tested, end)])
+        self._scales = _scales(states, reached)
+        return True
+
+    def _pieces(self, start: int, stop: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Answers for a range of states, in the order of the states."""
+        while start < stop:
+            yield self._answers[start]
+            start += len(self._answers[start][0])
+
+    def _test(self, outcomes: np.ndarray, successors: np.ndarray) -> None:
+        """Test the successors of the next states."""
+        assert self._scales is not None
+        slope_indices = _slope_indices(outcomes)
+        clusters = self._clusters(slope_indices)
+        self._tested += len(outcomes)
+        before = self.known
+        if self._each_addition:
+            added, complete = additions(
+                self._found.states[1:], self._clusters(self._preceding[1:before]),
+                successors, clusters,
+                _spread(successors), self._threshold, _ROUNDING, self._max_states - 1,
+            )  # fmt: skip
+            # Known to be new, whatever the scales: none of them lies at a distance of 0.
+            self._found.extend(successors[added], clusters[added], self._scales, 0.0)
+        else:
+            added, complete = self._found.extend(
+                successors, clusters, self._scales, self._threshold
+            )
+        if not complete:
+            raise MeshLimitError(
+                self._max_states, self.generations, self._tested - 1, self._threshold
+            )
+        if self.known > len(self._preceding):
+            room = np.zeros(max(256, self.known), dtype=np.uint32)
+            self._preceding = np.concatenate([self._preceding, room])
+        self._preceding[before : self.known] = slope_indices[added]
+
+    def mesh(self) -> Mesh:
+        """The mesh, once it is complete."""
+        n, m = self.known, len(self._slopes)
+        assert self.complete
+        assert self._scales is not None
+        targets = np.zeros((n, m), dtype=np.uint32)
+        outcomes = np.full((n, m), NOT_SIMULATED, np.uint8)
+        row = 1
+        for tried, reached in self._pieces(1, n):
+            rows = slice(row, row + len(tried))
+            outcomes[rows] = tried
+            targets[rows][tried == Outcome.STEP] = self._found.nearest(
+                reached, self._clusters(_slope_indices(tried)), self._scales
+            )
+            row += len(tried)
+        generation = np.repeat(
+            np.arange(self.generations, dtype=np.uint32), np.diff([0, *self._starts[1:]])
+        )
+        return Mesh(
+            slopes=self._slopes,
+            states=self._found.states.copy(),
+            preceding=self._preceding[:n].copy(),
+            generation=generation,
+            targets=targets,
+            outcomes=outcomes,
+            scales=self._scales,
+            threshold=self._threshold,
+            clustered=self._clustered,
+        )
+
+
 def grow_mesh(
     simulate: Simulate,
     initial_state: ArrayLike,
@@ -345,75 +557,23 @@ def grow_mesh(
     MeshLimitError
         If the mesh would hold more than `max_states` states.
     """
-    slopes = check_slopes(slopes)
-    m = len(slopes)
-    first = checked_array("initial_state", initial_state, np.float64, (STATE_SIZE,))[np.newaxis]
-    _check_finite("initial_state", first)
-    threshold = _check_threshold(threshold)
-    if scale_refresh not in SCALE_REFRESHES:
-        raise InputError("scale_refresh", scale_refresh, " or ".join(SCALE_REFRESHES))
-    if not (isinstance(max_states, Integral) and 2 <= max_states <= np.iinfo(np.uint32).max):
-        raise InputError("max_states", max_states, "a whole number, 2 to 4294967295")
-
-    found = StateSet(m if clustered else 1, max_states)
-    # One entry for each generation; the successors are kept for the targets, which only the
-    # final mesh decides.
-    preceding = [np.array([_slope_index(slopes, initial_slope, "initial_slope")], dtype=np.uint32)]
-    outcomes: list[np.ndarray] = []
-    successors: list[np.ndarray] = []
-    found.extend(first, np.zeros(1, np.uint32) if not clustered else preceding[0],
-                 np.ones(STATE_SIZE), threshold)  # fmt: skip
-    scales = np.full(STATE_SIZE, np.inf)
-    explored = 1
-
-    def clusters_of(slope_indices: np.ndarray) -> np.ndarray:
-        return slope_indices if clustered else np.zeros_like(slope_indices)
-
-    while explored < len(found):
-        new = found.states[explored:].copy()
-        if on_generation is not None:
-            on_generation(len(outcomes), explored, new.copy(), preceding[-1].copy())
-        tried, reached = _check_steps(simulate(new, slopes[preceding[-1]]), len(new), m)
-        explored += len(new)
-        outcomes.append(tried)
-        successors.append(reached)
-        slope_indices = _slope_indices(tried)
-        scales = _scales(found.states[1:], reached)
-        if scale_refresh == "generation":
-            added, complete = found.extend(reached, clusters_of(slope_indices), scales, threshold)
-        else:
-            added, complete = additions(
-                found.states[1:], clusters_of(np.concatenate(preceding)),
-                reached, clusters_of(slope_indices),
-                _spread(reached), threshold, _ROUNDING, max_states - 1,
-            )  # fmt: skip
-            # Known to be new, whatever the scales: none of them lies at a distance of 0.
-            found.extend(reached[added], clusters_of(slope_indices[added]), scales, 0.0)
-        if not complete:
-            raise MeshLimitError(max_states, len(outcomes), explored - 1, threshold)
-        preceding.append(slope_indices[added])
-
-    targets = np.zeros((len(found), m), dtype=np.uint32)
-    row = 1
-    for tried, reached in zip(outcomes, successors, strict=True):
-        succeeded = tried == Outcome.STEP
-        targets[row : row + len(tried)][succeeded] = found.nearest(
-            reached, clusters_of(_slope_indices(tried)), scales
-        )
-        row += len(tried)
-    return Mesh(
-        slopes=slopes,
-        states=found.states.copy(),
-        preceding=np.concatenate([np.zeros(1, np.uint32), *preceding]),
-        generation=np.repeat(
-            np.arange(len(preceding), dtype=np.uint32), [2, *map(len, preceding[1:])]
-        ),
-        targets=targets,
-        outcomes=np.concatenate([np.full((1, m), NOT_SIMULATED, np.uint8), *outcomes]),
-        scales=scales,
-        threshold=threshold,
+    growth = MeshGrowth(
+        initial_state,
+        slopes,
+        threshold,
+        initial_slope=initial_slope,
         clustered=clustered,
+        scale_refresh=scale_refresh,
+        max_states=max_states,
     )
+    generation = 0
+    while not growth.complete:
+        if on_generation is not None and growth.generations > generation:
+            on_generation(generation, *growth.generation(generation))
+            generation += 1
+        start, stop = growth.tested, growth.known
+        growth.take(start, simulate(*growth.states(start, stop)), stop - start)
+    return growth.mesh()
 
 
 def _slope_indices(outcomes: np.ndarray) -> np.ndarray:

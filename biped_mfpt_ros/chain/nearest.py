@@ -189,6 +189,7 @@ class StateSet:
     def _sort(self, weights: np.ndarray) -> None:
         """Sort all states by cluster and, in each, along its widest dimension."""
         count, clusters = self._count, self._clusters
+        self._sorted = count
         self._axes = np.zeros(clusters, dtype=np.int64)
         _widest_axes(
             self.states,
@@ -248,8 +249,12 @@ class StateSet:
         pieces = []
         position = 0
         while True:
-            self._sort(weights)
-            room = int(max(_UNSORTED_STATES, _UNSORTED_SHARE * self._count))
+            # Whatever the order, the answer is the same: it is the search that gets longer.
+            room = self._sorted - self._count
+            room += int(max(_UNSORTED_STATES, _UNSORTED_SHARE * self._sorted))
+            if room <= 0:
+                self._sort(weights)
+                continue
             self._reserve(room)
             added = np.empty(min(room, self._limit - self._count), dtype=np.int64)
             position, n = _extend(
@@ -278,7 +283,8 @@ class StateSet:
             uint32, shape (k,); 0 where the cluster has no state.
         """
         weights = 1.0 / scales
-        self._sort(weights)
+        if self._sorted < self._count:
+            self._sort(weights)
         out = np.empty(len(candidates), dtype=np.uint32)
         _nearest(candidates, clusters, weights, self._states, *self._index(), out)
         return out

@@ -22,8 +22,9 @@ class MeshAssembly:
     """One mesh, put together from its messages.
 
     Messages of one topic come in the order of their publication; the topics may be ahead of one
-    another. Messages are objects with the fields of `MeshInfo`, `MeshStates` and
-    `MeshTransitions`, as rclpy or a reader of bags makes them.
+    another, and messages of other meshes may lie between. A lost message shows in the indices of
+    the next one, or in the counts of the last. Messages are objects with the fields of
+    `MeshInfo`, `MeshStates` and `MeshTransitions`, as rclpy or a reader of bags makes them.
 
     Parameters
     ----------
@@ -49,7 +50,6 @@ class MeshAssembly:
         self.status: int | None = None
         self.problem = ""
         self._final: Any = None
-        self._sequence: dict[str, int] = {}
         self._early: list[tuple[Callable[[Any], None], Any]] = []
         self._states: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._rows: list[tuple[np.ndarray, np.ndarray]] = []
@@ -84,7 +84,7 @@ class MeshAssembly:
 
     def add_info(self, message: Any) -> None:
         """Take a `MeshInfo`."""
-        if not self._in_sequence("mesh/info", message):
+        if self.problem:
             return
         self.status = message.status
         if message.status in (MeshInfo.FAILED, MeshInfo.CANCELLED):
@@ -100,20 +100,18 @@ class MeshAssembly:
             self.step_map = message.step_map
             early, self._early = self._early, []
             for take, other in early:
-                take(other)
+                self._take(take, other)
         if message.status == MeshInfo.COMPLETE:
             self._final = message
             self._check_counts()
 
     def add_states(self, message: Any) -> None:
         """Take a `MeshStates`."""
-        if self._in_sequence("mesh/states", message):
-            self._take(self._take_states, message)
+        self._take(self._take_states, message)
 
     def add_transitions(self, message: Any) -> None:
         """Take a `MeshTransitions`."""
-        if self._in_sequence("mesh/transitions", message):
-            self._take(self._take_transitions, message)
+        self._take(self._take_transitions, message)
 
     def mesh(self) -> Mesh:
         """The whole mesh.
@@ -149,18 +147,6 @@ class MeshAssembly:
         except InputError as error:
             raise IncompleteMesh(f"mesh {self.mesh_id} cannot be used: {error}") from None
 
-    def _in_sequence(self, topic: str, message: Any) -> bool:
-        if self.problem:
-            return False
-        expected = self._sequence.get(topic, message.sequence)
-        self._sequence[topic] = message.sequence + 1
-        if message.sequence != expected:
-            self._spoil(
-                f"{topic}: message {message.sequence} came, where {expected} was due: "
-                "messages were lost"
-            )
-        return not self.problem
-
     def _spoil(self, problem: str) -> None:
         """Give the mesh up, and the memory of what has come of it."""
         self.problem = problem
@@ -168,9 +154,11 @@ class MeshAssembly:
 
     def _take(self, take: Callable[[Any], None], message: Any) -> None:
         # Topics may overtake one another; without the slope set nothing can be checked.
+        if self.problem:
+            return
         if self.settings is None:
             self._early.append((take, message))
-        elif not self.problem:
+        else:
             take(message)
 
     def _take_states(self, message: Any) -> None:
@@ -180,7 +168,7 @@ class MeshAssembly:
         elif message.first_index != self._state_count:
             self._spoil(
                 f"mesh/states: the next state was to have index {self._state_count}, not "
-                f"{message.first_index}"
+                f"{message.first_index}: messages were lost"
             )
         else:
             rows = states.reshape(-1, STATE_SIZE)
@@ -200,7 +188,7 @@ class MeshAssembly:
         elif message.first_index != self._row_count:
             self._spoil(
                 f"mesh/transitions: the next row was to have index {self._row_count}, not "
-                f"{message.first_index}"
+                f"{message.first_index}: messages were lost"
             )
         else:
             self._rows.append((targets.reshape(-1, m), outcomes.reshape(-1, m)))

@@ -1,8 +1,7 @@
-"""Chunks of swings over all simulators, and their answers in order. No rclpy in here.
+"""Chunks of swings over all simulators, for several meshes at once. No rclpy in here.
 
-A `FanOut` is the ``simulate`` that `grow_mesh` calls in the mesher. The answer for a state does not
-depend on the states beside it, so neither the sizes of chunks nor who answers them, nor when, nor
-how often, changes a bit of the result.
+The answer for a state does not depend on the states beside it, so neither the sizes of chunks nor
+who answers them, nor when, nor how often, changes a bit of a mesh.
 """
 
 from __future__ import annotations
@@ -28,6 +27,7 @@ _LEAST_SHARE = 0.2  # of a full chunk, below which splitting costs more than it 
 _MOST_OUTCOMES = 40_000  # in a chunk: keeps answers near the 1 MB that travel best
 _MANY_TIMES = 10.0  # how much longer than expected an answer may take before it is late
 _MOST_PATIENCE = 16.0  # by which that may grow
+_QUIET = 1.0  # s without a simulator that answers, before that is worth a word
 _MOST_FAILURES = 3  # refusals in a row before a simulator is dropped
 
 
@@ -60,12 +60,78 @@ class Simulators(Protocol):
         """Reasons, by the names of the simulators that were dropped."""
 
 
+class Growth(Protocol):
+    """What grows: see `biped_mfpt_ros.chain.mesh.MeshGrowth`."""
+
+    @property
+    def known(self) -> int:
+        """Number of states so far, the failure state counted; all of them may be simulated."""
+
+    def states(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        """States, shape (n, 10), and the slopes behind them, shape (n,)."""
+
+    def take(self, start: int, steps: Steps, n: int) -> None:
+        """Take the answer for n states from index ``start`` on."""
+
+
 @dataclass
+class Tally:
+    """What has been done so far for a job.
+
+    Attributes
+    ----------
+    swings : int
+        Swings answered, each counted once.
+    chunks : int
+        Requests sent.
+    chunks_repeated : int
+        Chunks handed on because their simulator was gone, late or dropped.
+    step_map_seconds : float
+        s, time in the step map, summed over the simulators.
+    """
+
+    swings: int = 0
+    chunks: int = 0
+    chunks_repeated: int = 0
+    step_map_seconds: float = 0.0
+
+
+@dataclass(eq=False)
+class Job:
+    """A mesh that grows.
+
+    Attributes
+    ----------
+    growth : Growth
+        Knows what is to be simulated, and takes the answers.
+    request : SimulateSteps.Request
+        Controller, model, slopes and step map of every request.
+    tally : Tally
+        What has been done.
+    error : Exception or None
+        Why it cannot go on: `NoSimulatorError`, or what ``growth.take`` raised.
+    """
+
+    growth: Growth
+    request: SimulateSteps.Request
+    tally: Tally = field(default_factory=Tally)
+    error: Exception | None = None
+    _handed_out: int = 1
+    _again: deque[_Chunk] = field(default_factory=deque)
+    _swing_seconds: float = 0.0
+    _since: float = field(default_factory=time.monotonic)
+
+    @property
+    def frontier(self) -> int:
+        """States known that have not been simulated."""
+        return self.growth.known - 1 - self.tally.swings
+
+
+@dataclass(eq=False)
 class _Chunk:
+    job: Job
     start: int
     stop: int
-    states: np.ndarray
-    previous: np.ndarray
     done: bool = False
 
 
@@ -83,8 +149,6 @@ class _Simulator:
     """Unanswered requests by ticket, oldest first. They are answered in this order."""
     heard: float = -math.inf
     """When the last answer came."""
-    swing_seconds: float = 0.0
-    """Cost of a swing, as answers told; 0: not known yet."""
     failures: int = 0
     patience: float = 1.0
     """Factor on the time after which it is late; doubled whenever it was."""
@@ -115,169 +179,116 @@ class FanOutSettings:
     wait_seconds: float = 10.0
 
 
-@dataclass
-class Tally:
-    """What has been done so far.
-
-    Attributes
-    ----------
-    swings : int
-        Swings answered, each counted once.
-    frontier : int
-        Swings of this generation not yet answered.
-    chunks : int
-        Requests sent.
-    chunks_repeated : int
-        Chunks handed on because their simulator was gone, late or dropped.
-    step_map_seconds : float
-        s, time in the step map, summed over the simulators.
-    """
-
-    swings: int = 0
-    frontier: int = 0
-    chunks: int = 0
-    chunks_repeated: int = 0
-    step_map_seconds: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """Outcomes and next states of a generation, as in `Steps`."""
-
-    outcomes: np.ndarray
-    next_states: np.ndarray
-
-
 class FanOut:
-    """Simulates swings on all simulators; to be called from one thread.
+    """Simulates the swings of jobs on all simulators; to be used from one thread.
 
     Parameters
     ----------
     simulators : Simulators
         Who can be asked.
-    request : SimulateSteps.Request
-        Controller, model, slopes and step map of every request.
     settings : FanOutSettings
-        How to go about it.
+        How to go about it. May be replaced at any time.
     log : callable
         Told what happens to simulators.
-    tick : callable
-        Called every 50 ms or so while waiting. What it raises ends the call.
     """
 
     def __init__(
         self,
         simulators: Simulators,
-        request: SimulateSteps.Request,
         settings: FanOutSettings,
         log: Callable[[str], object],
-        tick: Callable[[], object],
     ) -> None:
+        self.settings = settings
         self._available = simulators
-        self._request = request
-        self._slopes = len(request.slopes)
-        self._settings = settings
         self._log = log
-        self._tick = tick
         self._simulators: dict[str, _Simulator] = {}
-        self._answers: SimpleQueue[tuple[str, int, SimulateSteps.Response]] = SimpleQueue()
+        self._answers: SimpleQueue[tuple[str, int, SimulateSteps.Response] | None] = SimpleQueue()
         self._ticket = 0
         self._looked = -math.inf
         self._usable = -math.inf  # when there was last a simulator that is not late
-        self._again: deque[_Chunk] = deque()
-        self._steps: dict[int, Steps] = {}
-        self.tally = Tally()
+        self._waiting = False
+        # Whose turn it is comes first.
+        self._jobs: deque[Job] = deque()
 
     @property
     def simulators(self) -> int:
         """Simulators at work."""
         return sum(not s.late for s in self._simulators.values())
 
-    @property
-    def in_flight(self) -> int:
-        """Requests sent and not answered."""
-        return sum(len(s.asked) for s in self._simulators.values())
-
-    def __call__(self, states: np.ndarray, previous_slopes: np.ndarray) -> Answers:
-        """Simulate one step from every state, for every slope.
-
-        Parameters
-        ----------
-        states : numpy.ndarray
-            rad and rad/s, shape (n, 10).
-        previous_slopes : numpy.ndarray
-            rad, shape (n,).
-
-        Raises
-        ------
-        NoSimulatorError
-            If for the set time there was no simulator that answers.
-        """
-        n = len(states)
-        self._again.clear()
-        self._steps.clear()
-        self._usable = time.monotonic()
-        self.tally.frontier = n
-        handed_out = 0
-        while self.tally.frontier:
-            now = time.monotonic()
-            if now - self._looked >= _POLL:
-                self._looked = now
-                self._tick()
-                self._look_around(now)
-            while (simulator := self._next_simulator(now)) is not None:
-                while self._again and self._again[0].done:
-                    self._again.popleft()
-                if self._again:
-                    chunk = self._again.popleft()
-                elif handed_out < n:
-                    stop = handed_out + self._size(n - handed_out)
-                    chunk = _Chunk(
-                        handed_out,
-                        stop,
-                        states[handed_out:stop],
-                        previous_slopes[handed_out:stop],
-                    )
-                    handed_out = stop
-                else:
-                    break
-                self._ask(simulator, chunk, now)
-                if simulator.late:
-                    self._repeat(chunk)  # nobody is to wait for it
-            try:
-                answer = self._answers.get(timeout=_POLL)
-                while True:
-                    self._take(*answer)
-                    answer = self._answers.get_nowait()
-            except Empty:
-                pass
-        in_order = [self._steps[start] for start in sorted(self._steps)]
-        return Answers(
-            np.concatenate([steps.outcomes for steps in in_order]),
-            np.concatenate([steps.next_states for steps in in_order]),
+    def in_flight(self, job: Job | None = None) -> int:
+        """Requests sent and not answered, of one job or of all."""
+        return sum(
+            job is None or asked.chunk.job is job
+            for simulator in self._simulators.values()
+            for asked in simulator.asked.values()
         )
 
-    def close(self) -> None:
-        """Forget all requests that are still unanswered."""
-        for simulator in self._simulators.values():
-            for asked in simulator.asked.values():
-                asked.forget()
-            simulator.asked.clear()
+    def add(self, job: Job) -> None:
+        """Begin a job. It ends when it is removed."""
+        self._jobs.append(job)
 
-    def _size(self, remaining: int) -> int:
+    def remove(self, job: Job) -> None:
+        """Forget a job, and its requests that are still unanswered."""
+        self._jobs.remove(job)
+        for simulator in self._simulators.values():
+            for ticket in [t for t, a in simulator.asked.items() if a.chunk.job is job]:
+                simulator.asked.pop(ticket).forget()
+
+    def wake(self) -> None:
+        """End the wait of `step`; from any thread."""
+        self._answers.put(None)
+
+    def step(self, timeout: float) -> None:
+        """Hand out what can be, and take the answers that come within a time (s)."""
+        now = time.monotonic()
+        if now - self._looked >= _POLL:
+            self._looked = now
+            self._look_around(now)
+        while self._jobs and (simulator := self._next_simulator(now)) is not None:
+            chunk = self._next_chunk()
+            if chunk is None:
+                break
+            self._ask(simulator, chunk, now)
+            if simulator.late:
+                self._repeat(chunk)  # nobody is to wait for it
+        try:
+            answer = self._answers.get(timeout=timeout)
+            while True:
+                if answer is not None:
+                    self._take(*answer)
+                answer = self._answers.get_nowait()
+        except Empty:
+            pass
+
+    def _next_chunk(self) -> _Chunk | None:
+        """The next chunk of the job whose turn it is, of those that have something to do."""
+        for _ in range(len(self._jobs)):
+            job = self._jobs[0]
+            self._jobs.rotate(-1)
+            if job.error is not None:
+                continue
+            while job._again and job._again[0].done:
+                job._again.popleft()
+            if job._again:
+                return job._again.popleft()
+            ready = job.growth.known - job._handed_out
+            if ready > 0:
+                start = job._handed_out
+                job._handed_out = start + self._size(job, ready)
+                return _Chunk(job, start, job._handed_out)
+        return None
+
+    def _size(self, job: Job, ready: int) -> int:
         """Swings of the next chunk: the fewer are left, the smaller, so that all end together."""
-        simulators = self._simulators.values()
-        known = [s.swing_seconds for s in simulators if s.swing_seconds]
-        swing = sum(known) / len(known) if known else _FIRST_SWING
-        full = round(self._settings.chunk_seconds / swing)
-        full = max(1, min(full, _MOST_OUTCOMES // self._slopes))
+        full = round(self.settings.chunk_seconds / (job._swing_seconds or _FIRST_SWING))
+        full = max(1, min(full, _MOST_OUTCOMES // len(job.request.slopes)))
         least = max(1, round(_LEAST_SHARE * full))
-        share = math.ceil(remaining / (2 * max(1, self.simulators)))
-        return min(remaining, max(least, min(full, share)))
+        share = math.ceil(ready / (2 * max(1, self.simulators)))
+        return min(ready, max(least, min(full, share)))
 
     def _next_simulator(self, now: float) -> _Simulator | None:
         """Who gets the next chunk: the one with the least to do, if anyone has room."""
-        most = self._settings.in_flight
+        most = self.settings.in_flight
         best = None
         for simulator in self._simulators.values():
             if simulator.late:
@@ -292,13 +303,15 @@ class FanOut:
         return best
 
     def _ask(self, simulator: _Simulator, chunk: _Chunk, now: float) -> None:
+        job = chunk.job
+        states, previous = job.growth.states(chunk.start, chunk.stop)
         request = SimulateSteps.Request(
-            step_map=self._request.step_map,
-            controller=self._request.controller,
-            model=self._request.model,
-            slopes=self._request.slopes,
-            states=packed(chunk.states, "d"),
-            previous_slopes=packed(chunk.previous, "d"),
+            step_map=job.request.step_map,
+            controller=job.request.controller,
+            model=job.request.model,
+            slopes=job.request.slopes,
+            states=packed(states, "d"),
+            previous_slopes=packed(previous, "d"),
         )
         self._ticket += 1
         ticket, name, answers = self._ticket, simulator.name, self._answers
@@ -310,7 +323,7 @@ class FanOut:
             self._fail(simulator, chunk, f"could not be asked: {error!r}")
             return
         simulator.asked[ticket] = _Asked(chunk, now, forget)
-        self.tally.chunks += 1
+        job.tally.chunks += 1
 
     def _take(self, name: str, ticket: int, response: SimulateSteps.Response) -> None:
         simulator = self._simulators.get(name)
@@ -318,8 +331,9 @@ class FanOut:
         if simulator is None or asked is None:
             return
         chunk = asked.chunk
+        job = chunk.job
         simulator.heard = time.monotonic()
-        wanted = self._request.step_map
+        wanted = job.request.step_map
         if response.step_map != wanted:
             self._drop(simulator, f"runs step map {response.step_map}, not {wanted}", chunk)
             return
@@ -328,28 +342,28 @@ class FanOut:
             return
         n = chunk.stop - chunk.start
         try:
-            steps = steps_from(response, n, self._slopes)
+            steps = steps_from(response, n, len(job.request.slopes))
         except InputError as error:
             self._drop(simulator, f"gave an answer that cannot be: {error}", chunk)
             return
         simulator.failures = 0
         swing = max(steps.seconds / n, 1e-7)
-        simulator.swing_seconds = (
-            0.7 * simulator.swing_seconds + 0.3 * swing if simulator.swing_seconds else swing
-        )
+        job._swing_seconds = 0.7 * job._swing_seconds + 0.3 * swing if job._swing_seconds else swing
         if simulator.late:
             simulator.late = False
             # A simulator answers in order, so the requests before this one got lost on the way.
             for lost in [earlier for earlier in simulator.asked if earlier < ticket]:
                 simulator.asked.pop(lost).forget()
             self._log(f"{name} answers again")
-        if chunk.done:
+        if chunk.done or job.error is not None:
             return  # it was late, and another one was faster
         chunk.done = True
-        self._steps[chunk.start] = steps
-        self.tally.frontier -= n
-        self.tally.swings += n
-        self.tally.step_map_seconds += steps.seconds
+        job.tally.swings += n
+        job.tally.step_map_seconds += steps.seconds
+        try:
+            job.growth.take(chunk.start, steps, n)
+        except Exception as error:
+            job.error = error
 
     def _look_around(self, now: float) -> None:
         """See who came, who went, who is late."""
@@ -367,16 +381,27 @@ class FanOut:
         for simulator in self._simulators.values():
             if simulator.asked and not simulator.late:
                 self._check_late(simulator, now)
-        if self.simulators:
-            self._usable = now
-        elif now - self._usable > self._settings.wait_seconds:
-            raise NoSimulatorError(self._none_answers())
+        if self.simulators or not self._jobs:
+            if self._waiting:
+                self._log("there is a simulator again: going on")
+            self._usable, self._waiting = now, False
+            return
+        wait = self.settings.wait_seconds
+        if not self._waiting and now - self._usable > min(_QUIET, wait):
+            self._waiting = True
+            self._log(f"no simulator answers: waiting for one, for {wait:g} s ({self._why()})")
+        for job in self._jobs:
+            if job.error is None and now - max(self._usable, job._since) > wait:
+                job.error = NoSimulatorError(f"no simulator answered for {wait:g} s: {self._why()}")
 
     def _limit(self, simulator: _Simulator) -> float:
         """Time after which its oldest request is late, s."""
-        swings = next((a.chunk.stop - a.chunk.start for a in simulator.asked.values()), 0)
-        expected = swings * (simulator.swing_seconds or _FIRST_SWING)
-        return simulator.patience * max(self._settings.timeout, _MANY_TIMES * expected)
+        oldest = next(iter(simulator.asked.values()), None)
+        expected = 0.0
+        if oldest is not None:
+            chunk = oldest.chunk
+            expected = (chunk.stop - chunk.start) * (chunk.job._swing_seconds or _FIRST_SWING)
+        return simulator.patience * max(self.settings.timeout, _MANY_TIMES * expected)
 
     def _check_late(self, simulator: _Simulator, now: float) -> None:
         limit = self._limit(simulator)
@@ -395,9 +420,10 @@ class FanOut:
             self._repeat(asked.chunk)
 
     def _repeat(self, chunk: _Chunk) -> None:
-        if not chunk.done and all(chunk is not other for other in self._again):
-            self._again.append(chunk)
-            self.tally.chunks_repeated += 1
+        job = chunk.job
+        if not chunk.done and chunk not in job._again:
+            job._again.append(chunk)
+            job.tally.chunks_repeated += 1
 
     def _fail(self, simulator: _Simulator, chunk: _Chunk, reason: str) -> None:
         simulator.failures += 1
@@ -416,10 +442,10 @@ class FanOut:
         for asked in simulator.asked.values():
             asked.forget()
 
-    def _none_answers(self) -> str:
+    def _why(self) -> str:
+        """Why there is no simulator that answers."""
         reasons = [f"{name} is late" for name, s in self._simulators.items() if s.late]
         reasons += [f"{name}, dropped, {why}" for name, why in self._available.dropped.items()]
-        why = "; ".join(reasons) or (
+        return "; ".join(reasons) or (
             "there is none on the graph; start one with: ros2 run biped_mfpt_ros simulator"
         )
-        return f"no simulator answered for {self._settings.wait_seconds:g} s: {why}"

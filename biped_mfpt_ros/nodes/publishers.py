@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 from rclpy.node import Node
@@ -11,7 +12,7 @@ from biped_mfpt_ros.nodes.messages import stamp
 
 
 class CountedPublisher:
-    """Publisher that numbers its messages from 0 and stamps them; for one thread at a time.
+    """Publisher that numbers its messages from 0 and stamps them; for any thread.
 
     Parameters
     ----------
@@ -28,10 +29,12 @@ class CountedPublisher:
     def __init__(self, node: Node, kind: type[Any], topic: str, qos: QoSProfile) -> None:
         self._publisher = node.create_publisher(kind, topic, qos)
         self._sequence = 0
+        self._lock = threading.Lock()
 
     def publish(self, message: Any) -> None:
         """Number, stamp and publish a message."""
-        message.sequence = self._sequence
-        message.stamp = stamp()
-        self._sequence += 1
-        self._publisher.publish(message)
+        with self._lock:
+            message.sequence = self._sequence
+            message.stamp = stamp()
+            self._sequence += 1
+            self._publisher.publish(message)
