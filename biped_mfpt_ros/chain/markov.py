@@ -297,7 +297,10 @@ def _squared(q: np.ndarray, falls: np.ndarray, among: np.ndarray) -> np.ndarray:
         power[rare] *= ((1.0 - left[rare]) / survives[rare])[:, np.newaxis]
         if survives.max() < 1e-100:
             power /= survives.max()
-        rows = power[among] / power[among].sum(axis=1)[:, np.newaxis]
+        sums = power[among].sum(axis=1)[:, np.newaxis]
+        if not sums.all():
+            raise ChainError("probabilities of the chain are too small to be told from zero")
+        rows = power[among] / sums
         previous, x = x, rows[0]
         floor = TOLERANCE / n * float(x @ falls)
         # A slow part that still fills doubles its weight, what is missing of it is squared.

@@ -209,7 +209,11 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     out[_THETA_START] = start
     out[_SLOPE] = 1.0 / (end - start)
     out[_OFF] = parameters[-1] if parameters.size > len(PARAMETERS) else math.inf
-    out[_MONOMIAL:] = (bezier @ _bernstein_to_monomial()).ravel()
+    with np.errstate(over="ignore", invalid="ignore"):
+        monomials = bezier @ _bernstein_to_monomial()
+    if not np.isfinite(monomials).all():
+        raise InputError("parameters[alpha]", bezier.tolist(), "numbers whose sums are finite")
+    out[_MONOMIAL:] = monomials.ravel()
     return out
 
 

@@ -190,8 +190,9 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     # Where k w^exponent = STEEPEST w; a plain PD law (exponent 1) needs no such range.
     out[_WIDTH : _WIDTH + 4] = 0.0
     bent = exponent < 1.0
-    out[_WIDTH : _WIDTH + 4][bent] = (parameters[6:10] / STEEPEST)[bent] ** (
-        1.0 / (1.0 - exponent[bent])
-    )
+    with np.errstate(over="ignore"):  # an infinite range is one where the law is linear throughout
+        out[_WIDTH : _WIDTH + 4][bent] = (parameters[6:10] / STEEPEST)[bent] ** (
+            1.0 / (1.0 - exponent[bent])
+        )
     out[_RATE : _RATE + 4] = 1.0 / parameters[14:18]
     return out

@@ -7,6 +7,16 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 
+class PromiseBroken(AssertionError):
+    """Something is not as `docs/promises.md` says."""
+
+
+def check(holds: bool, what: str = "a promise was broken") -> None:
+    """Raise PromiseBroken unless something holds; unlike ``assert``, also under ``python -O``."""
+    if not holds:
+        raise PromiseBroken(what)
+
+
 @dataclass(frozen=True)
 class Row:
     """A line of the result.

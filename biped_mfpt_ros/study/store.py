@@ -35,12 +35,12 @@ class Store:
         """The result of a job, or None if there is none that can be read."""
         try:
             kept = json.loads(self.path(job).read_text())
-        except (FileNotFoundError, ValueError):
+        except (FileNotFoundError, ValueError, RecursionError):
             return None
         if not isinstance(kept, dict) or kept.get("inputs") != job.inputs:
             return None
-        result: dict[str, Any] = kept["result"]
-        return result
+        result = kept.get("result")
+        return result if isinstance(result, dict) else None
 
     def put(self, job: Job, result: dict[str, Any]) -> None:
         """Keep the result of a job, of JSON's types (infinities as the strings of `plain`)."""

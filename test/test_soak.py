@@ -1,0 +1,76 @@
+"""The soak runs in short: what they break holds, and they do notice what does not."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import nullcontext
+
+import pytest
+
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.report.progress import Progress
+from biped_mfpt_ros.soak import __main__ as soak
+from biped_mfpt_ros.soak import fuzz, targets
+
+QUIET = Progress(quiet=True)
+
+
+@pytest.mark.parametrize("target", targets.TARGETS, ids=lambda target: target.name)
+def test_bad_input_is_taken_or_refused_clearly(target):
+    fuzz.warm_up()
+    share = target.share / sum(other.share for other in targets.TARGETS)
+    inputs = round(fuzz.SHORT_INPUTS * share)
+    row = fuzz.run_target(target, max(1, inputs), 1, QUIET)
+    assert row.failures == 0, "\n".join(row.examples)
+    assert row.count >= inputs
+
+
+def test_the_fuzzer_notices_what_is_wrong(monkeypatch):
+    def give(random):
+        kind = random.randrange(4)
+        if kind == 0:
+            raise KeyError("a bug")
+        if kind == 1:
+            raise InputError("field", 1, "")
+        if kind == 2:
+            raise InputError("field", 1, "2")
+
+    row = fuzz.fuzz("target", give, 100, 1, QUIET)
+    assert 25 < row.failures < 75
+    assert 0 < row.facts["refused"] < 100
+    assert any("a bug" in example for example in row.examples)
+    assert any("without what is allowed" in example for example in row.examples)
+    again = fuzz.fuzz("target", give, 100, 1, QUIET)
+    assert again.examples == row.examples
+    assert fuzz.fuzz("target", give, 100, 2, QUIET).examples != row.examples
+
+    monkeypatch.setattr(fuzz, "MOST_SECONDS", 0.05)
+
+    def slow(random):
+        end = time.process_time() + 0.1
+        while time.process_time() < end:
+            pass
+
+    assert fuzz.fuzz("slow", slow, 3, 1, QUIET).failures == 3
+
+    kept = []
+    leaking = fuzz.fuzz("leaking", lambda random: kept.append(b"x" * 10**6), 100, 1, QUIET)
+    assert leaking.failures == 1
+    assert "grew by" in leaking.examples[0]
+
+
+def test_soak_prints_a_table_or_json_and_fails_with_what_failed(capsys, monkeypatch):
+    def bug(random):
+        raise KeyError("a bug")
+
+    entry = targets.TargetEntry("buggy", 1.0, lambda: nullcontext(bug))
+    monkeypatch.setattr(targets, "TARGETS", (entry,))
+    monkeypatch.setattr(fuzz, "warm_up", lambda: None)
+    monkeypatch.setattr(fuzz, "SHORT_INPUTS", 7)
+    assert soak.main(["--short", "--only", "fuzz", "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert result["failures"] == 7
+    assert result["rows"][0]["count"] == 7
+    assert soak.main(["--short", "--only", "fuzz"]) == 1
+    assert "FAILED fuzz, buggy: input 0" in capsys.readouterr().out
