@@ -206,6 +206,22 @@ def test_a_job_that_fails_leaves_the_others_alone(swings):
     assert bad.tally.chunks < 6
 
 
+def first_three(fake, request, answer):
+    """As a simulator does when swings crawl: it answers for the first states only."""
+    request.states = request.states[:30]
+    request.previous_slopes = request.previous_slopes[:3]
+    good(fake, request, answer)
+
+
+@pytest.mark.parametrize("other", [good, silent, first_three])
+def test_answers_for_a_part_are_taken_and_the_rest_is_asked_again(swings, other):
+    # Requests of 10 states, and an answer for 3 of them each.
+    tally = run(fan_out(Fake(part=first_three, other=other)), job_of(swings))
+    assert tally.swings == 300
+    assert tally.chunks > 300 / 10
+    assert (tally.chunks_repeated > 0) == (other is silent)
+
+
 @pytest.mark.parametrize(
     ("way", "dropped", "said"),
     [

@@ -340,9 +340,11 @@ class FanOut:
         if not response.success:
             self._fail(simulator, chunk, f"refuses: {response.message}")
             return
-        n = chunk.stop - chunk.start
+        m = len(job.request.slopes)
+        # Where swings crawl, an answer is for the first ones only.
+        n = min(chunk.stop - chunk.start, max(1, len(response.outcomes) // m))
         try:
-            steps = steps_from(response, n, len(job.request.slopes))
+            steps = steps_from(response, n, m)
         except InputError as error:
             self._drop(simulator, f"gave an answer that cannot be: {error}", chunk)
             return
@@ -358,6 +360,10 @@ class FanOut:
         if chunk.done or job.error is not None:
             return  # it was late, and another one was faster
         chunk.done = True
+        rest = chunk.start + n
+        while rest < chunk.stop:
+            start, rest = rest, rest + self._size(job, chunk.stop - rest)
+            job._again.append(_Chunk(job, start, rest))
         job.tally.swings += n
         job.tally.step_map_seconds += steps.seconds
         try:
