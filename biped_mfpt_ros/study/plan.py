@@ -13,7 +13,8 @@ import numpy as np
 from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import STEP_MAP
-from biped_mfpt_ros.study.readings import readings
+from biped_mfpt_ros.study.readings import readings, settings_of
+from biped_mfpt_ros.walker.robot import WalkerModel
 
 SEED = 1
 WALKS = 10_000
@@ -89,30 +90,34 @@ class Job:
     Attributes
     ----------
     kind : str
-        ``cycle``, ``mesh``, ``walks``, ``tolerance``, ``slopes`` or ``pictures``.
+        ``cycle``, ``mesh``, ``walks``, ``tolerance``, ``slopes`` or ``pictures``; ``reading`` or
+        ``scatter`` in a fit of the readings.
     controller : str
         What walks.
     settings : dict
         What else decides the result, of JSON's types; slopes in degrees.
     seconds : float
         s on two cores, roughly.
+    model : WalkerModel or None
+        What it walks with, if not the controller's reading.
     """
 
     kind: str
     controller: str
     settings: dict[str, Any] = field(default_factory=dict)
     seconds: float = 1.0
+    model: WalkerModel | None = None
 
     @property
     def inputs(self) -> dict[str, Any]:
         """All that decides the result, of JSON's types."""
         values = controller(self.controller).parameters
-        model = {k: repr(v) for k, v in readings()[self.controller].settings.items()}
+        model = self.model or readings()[self.controller].model
         return {
             "kind": self.kind,
             "controller": self.controller,
             "parameters": hashlib.sha256(values.tobytes()).hexdigest()[:16],
-            "model": model,
+            "model": {k: repr(v) for k, v in settings_of(model).items()},
             "settings": self.settings,
             "step_map": STEP_MAP,
         }

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, fields
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.walker.robot import WalkerModel
@@ -40,9 +41,14 @@ class Reading:
     source: str
 
     @property
-    def settings(self) -> dict[str, float]:
+    def settings(self) -> dict[str, Any]:
         """The model's settings by name, SI units."""
-        return {name: getattr(self.model, name) for name in _SETTINGS}
+        return settings_of(self.model)
+
+
+def settings_of(model: WalkerModel) -> dict[str, Any]:
+    """Settings of a model by name, SI units; the links are RABBIT's."""
+    return {name: getattr(model, name) for name in _SETTINGS}
 
 
 @cache

@@ -110,37 +110,58 @@ def tolerance(
 
 def slopes(job: Job, state: list[float]) -> dict[str, Any]:
     """Section 6.3 on hzd/base: steps down 1 degree, and down 9 with torques off late in a step."""
-    base = controller(job.controller)
-    off = Controller(f"{base.name}/off", base.scheme, np.append(base.parameters, _PHASE_OFF))
-    model, most = readings()[job.controller].model, job.settings["steps"]
-    steepening = math.radians(job.settings["steepening_deg"])
+    model = readings()[job.controller].model
+    most, steepening_deg = job.settings["steps"], job.settings["steepening_deg"]
     limitless = replace(model, torque_limit=math.inf)
     cases = (
-        (base, 0.0, model), (base, -1.0, model), (base, -1.0, limitless),
-        (off, 0.0, model), (off, -1.0, model), (off, -9.0, model),
+        (False, 0.0, model), (False, -1.0, model), (False, -1.0, limitless),
+        (True, 0.0, model), (True, -1.0, model), (True, -9.0, model),
     )  # fmt: skip
     return {
         "rows": [
             {
-                "torques_off_late": walking is off,
+                "torques_off_late": off,
                 "torque_limit": limits.torque_limit,
                 "slope_deg": degrees,
-                **_steps_on(walking, math.radians(degrees), limits, state, most, steepening),
+                **steps_on(off, degrees, limits, state, most, steepening_deg),
             }
-            for walking, degrees, limits in cases
+            for off, degrees, limits in cases
         ]
     }
 
 
-def _steps_on(
-    walking: Controller,
-    slope: float,
+def steps_on(
+    off: bool,
+    slope_deg: float,
     model: WalkerModel,
     state: list[float],
     most: int,
-    steepening: float,
+    steepening_deg: float,
 ) -> dict[str, Any]:
-    """Steps until the fall where flat ground gets steeper, step by step, to a constant slope."""
+    """Steps of hzd/base where flat ground gets steeper, step by step, to a constant slope.
+
+    Parameters
+    ----------
+    off : bool
+        Whether there is no torque late in a step (section 6.3).
+    slope_deg, steepening_deg : float
+        Degrees, the slope in the end and how much steeper it gets from step to step.
+    model : WalkerModel
+    state : list of float
+        Where it starts, ``[q, dq]``, rad and rad/s.
+    most : int
+        Steps after which it is taken to walk on.
+
+    Returns
+    -------
+    dict
+        ``steps`` before the fall, and how it ``fell``: None if it walks on.
+    """
+    walking = controller("hzd/base")
+    if off:
+        late = np.append(walking.parameters, _PHASE_OFF)
+        walking = Controller(f"{walking.name}/off", walking.scheme, late)
+    slope, steepening = math.radians(slope_deg), math.radians(steepening_deg)
     at, behind = np.array([state]), 0.0
     for taken in range(most):
         ahead = math.copysign(min(abs(slope), (taken + 1) * steepening), slope)
