@@ -9,7 +9,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import NoLimitCycle, find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import MonteCarlo, monte_carlo
@@ -95,6 +95,15 @@ def test_a_stable_cycle_is_preferred_to_an_unstable_one():
 def test_no_cycle_is_an_error_that_says_how_it_ended():
     with pytest.raises(NoLimitCycle, match=r"hzd/base .* slope of -5 degrees .* most falls: "):
         find_limit_cycle(controller("hzd/base"), math.radians(-5.0))
+
+
+def test_a_search_that_crawls_is_given_up(monkeypatch):
+    monkeypatch.setattr("biped_mfpt_ros.gait.cycle._MOST_EVALUATIONS", 500_000)
+    parameters = controller("hzd/base").parameters.copy()
+    parameters[1] = 1e4  # damping that makes the integrator take tiny steps
+    crawling = Controller("crawling", "hzd", parameters)
+    with pytest.raises(NoLimitCycle, match="crawling found: the search was given up after"):
+        find_limit_cycle(crawling, model=WalkerModel(friction=math.inf))
 
 
 def test_walks_depend_on_their_seed_alone():

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
-from biped_mfpt_ros.gait.step import check_states, simulate_steps
+from biped_mfpt_ros.gait.step import Steps, check_states, simulate_steps
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel
 
@@ -18,6 +18,7 @@ _WALK_STEPS = 60  # plain steps of the search before it gives up
 _NEWTON_STEPS = 25
 _DIFFERENCE = 1e-5  # rad and rad/s, half the width of a central difference
 _TOLERANCE = 1e-11  # of the integrator: a difference of _DIFFERENCE then keeps six digits
+_MOST_EVALUATIONS = 20_000_000  # of a search, some 6 s; the paper's gaits take up to 4 million
 _RESIDUAL = 1e-9  # rad and rad/s, of a cycle that has been found
 
 
@@ -102,7 +103,7 @@ def find_limit_cycle(
     Raises
     ------
     NoLimitCycle
-        If none was found.
+        If none was found, or the swings cost too much to look for one.
     InputError
         If slope or guess is not allowed.
     """
@@ -112,11 +113,12 @@ def find_limit_cycle(
         states = np.array([controller.reference_state(r, model.robot) for r in _START_RATES])
     else:
         states = check_states(np.atleast_2d(np.asarray(guess, dtype=np.float64)), "guess")
+    search = _Search(controller, slope, model)
     falls: np.ndarray = np.empty(0, dtype=np.uint8)
     unstable: LimitCycle | None = None
     behind = slope if guess is not None else 0.0  # the starts come from flat ground
     for walked in range(_WALK_STEPS):
-        steps = simulate_steps(controller, states, np.full(len(states), behind), [slope], model)
+        steps = search.steps(states, behind)
         behind = slope
         upright = steps.outcomes[:, 0] == Outcome.STEP
         falls = steps.outcomes[~upright, 0] if (~upright).any() else falls
@@ -126,7 +128,7 @@ def find_limit_cycle(
         best = int(np.argmin(distance))
         # Newton from the start is cheap and catches unstable cycles; later only near a cycle.
         if walked in (0, 5, _WALK_STEPS - 1) or distance[best] < 1e-3:
-            cycle = _newton(controller, slope, model, steps.next_states[best])
+            cycle = _newton(search, steps.next_states[best])
             if cycle is not None and cycle.stable:
                 return cycle
             unstable = unstable or cycle
@@ -144,13 +146,34 @@ def find_limit_cycle(
     )
 
 
-def _newton(
-    controller: Controller, slope: float, model: WalkerModel, state: np.ndarray
-) -> LimitCycle | None:
+class _Search:
+    """The step map on a slope, with a bound on what all its swings may cost together."""
+
+    def __init__(self, controller: Controller, slope: float, model: WalkerModel) -> None:
+        self.controller, self.slope, self.model = controller, slope, model
+        self._left = _MOST_EVALUATIONS
+
+    def steps(self, states: np.ndarray, behind: float) -> Steps:
+        """One step from each state; NoLimitCycle when that costs too much."""
+        previous = np.full(len(states), behind)
+        steps = simulate_steps(
+            self.controller, states, previous, [self.slope], self.model, self._left
+        )
+        self._left -= steps.evaluations
+        if self._left <= 0:
+            raise NoLimitCycle(
+                f"no limit cycle of {self.controller.name} found: the search was given up after "
+                f"{_MOST_EVALUATIONS} evaluations of the closed loop, as its swings crawl"
+            )
+        return steps
+
+
+def _newton(search: _Search, state: np.ndarray) -> LimitCycle | None:
     """Damped Newton iteration from a state; None where it does not converge."""
+    slope, robot = search.slope, search.model.robot
 
     def residual(states: np.ndarray) -> tuple[np.ndarray, bool]:
-        steps = simulate_steps(controller, states, np.full(len(states), slope), [slope], model)
+        steps = search.steps(states, slope)
         if not (steps.outcomes == Outcome.STEP).all():
             return states, False
         return steps.next_states - states, True
@@ -164,13 +187,13 @@ def _newton(
         jacobian = (around[:STATE_SIZE] - around[STATE_SIZE:]).T / (2.0 * _DIFFERENCE)
         size = np.abs(value).max()
         if size < _RESIDUAL:
-            steps = simulate_steps(controller, state[None], [slope], [slope], model)
+            steps = search.steps(state[None], slope)
             length = float(steps.step_lengths[0, 0])
-            weight = model.robot.mass * model.robot.gravity
+            weight = robot.mass * robot.gravity
             eigenvalues = np.linalg.eigvals(jacobian + np.eye(STATE_SIZE))
             order = np.argsort(-np.abs(eigenvalues), kind="stable")
             return LimitCycle(
-                controller=controller,
+                controller=search.controller,
                 slope=slope,
                 state=state,
                 period=float(steps.durations[0, 0]),
