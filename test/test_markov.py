@@ -11,10 +11,11 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 from scipy.sparse.linalg import eigs
 
-from biped_mfpt_ros.chain import markov
+from biped_mfpt_ros.chain import iteration, markov
 from biped_mfpt_ros.chain.markov import (
     ChainError,
     Metastability,
+    metastabilities,
     metastability,
     slope_probabilities,
     solve_chain,
@@ -370,6 +371,156 @@ def test_usual_chains_are_iterated(only_iteration):
     assert result.mfpt_from_state[1] == pytest.approx(result.mfpt, rel=1e-3)
 
 
+# Many distributions, large chains ---------------------------------------------------------------
+
+
+def lifted(rows, m, copies) -> tuple[np.ndarray, np.ndarray]:
+    """Targets and outcomes of a chain whose states are (state of a small chain, copy).
+
+    Copy k goes to copy (m k + s) mod copies on slope s: it tells the slopes of the last steps
+    apart, as the states of a mesh do. Falls depend on the small chain's state alone, so lambda_2
+    is that of the small chain, exactly.
+    """
+    states, k, s = np.ix_(range(len(rows)), range(copies), range(m))
+    to = np.array(rows)[states, s]
+    targets = np.where(to > 0, 1 + (to - 1) * copies + (m * k + s) % copies, 0).reshape(-1, m)
+    targets = np.concatenate([np.zeros((1, m)), targets]).astype(np.uint32)
+    outcomes = np.where(targets == 0, 5, 0).astype(np.uint8)
+    outcomes[0] = NOT_SIMULATED
+    return targets, outcomes
+
+
+def mesh_of(targets, outcomes, slopes) -> Mesh:
+    n = len(targets)
+    return Mesh(
+        slopes=slopes,
+        states=np.zeros((n, 10)),
+        preceding=np.zeros(n),
+        generation=np.zeros(n),
+        targets=targets,
+        outcomes=outcomes,
+        scales=np.ones(10),
+        threshold=0.1,
+        clustered=True,
+    )
+
+
+def assert_same_bits(one: Metastability, other: Metastability) -> None:
+    assert one.mfpt == other.mfpt
+    assert one.failure_probability == other.failure_probability
+    assert one.lambda_2 == other.lambda_2
+    assert one.failure_shares == other.failure_shares
+    assert np.array_equal(one.distribution, other.distribution)
+
+
+SIGMAS = np.radians([1.25, 0.715, 0.526, 0.432, 3.0])  # MFPT 1e3, 1e8, 1e14, 1e20, and a few
+
+
+def test_large_chain_in_high_precision():
+    rows, slopes = walker(4, 0.5)
+    mesh = mesh_of(*lifted(rows, len(slopes), 6561), slopes)
+    found = metastabilities(mesh, 0.0, SIGMAS)
+    for sigma, result in zip(SIGMAS, found, strict=True):
+        p = slope_probabilities(slopes, 0.0, sigma)
+        assert relative(result.mfpt, 1 / exact_failure_probability(rows, p)) < RELATIVE
+    times = found[2].mfpt_from_state[1:].reshape(len(rows), -1)
+    exact = exact_times(rows, slope_probabilities(slopes, 0.0, SIGMAS[2]))
+    for copies, reference in zip(times, exact, strict=True):
+        assert relative(copies.min(), reference) < RELATIVE
+        assert relative(copies.max(), reference) < RELATIVE
+
+
+@pytest.mark.parametrize("e", [1e-3, 1e-14, 1e-60])
+def test_large_tree_with_a_rare_fall_from_a_rare_leaf(e):
+    # From the root over m branches to m^2 leaves and back, where one leaf falls on the first
+    # slope. It has probability q^2, so lambda_2^3 = 1 - q^2 e. Period 3.
+    m = 100
+    branches, leaves = 2 + np.arange(m), 2 + m + np.arange(m * m)
+    targets = np.ones((leaves[-1] + 1, m), dtype=np.uint32)
+    targets[0] = 0
+    targets[1] = branches
+    targets[branches] = leaves.reshape(m, m)
+    targets[leaves[-1], 0] = 0
+    outcomes = np.where(targets == 0, 1, 0).astype(np.uint8)
+    outcomes[0] = NOT_SIMULATED
+    q = (1.0 - e) / (m - 1)
+    result = solve_chain(targets, outcomes, [e, *[q] * (m - 1)])
+    escape = -math.expm1(math.log1p(-q * q * e) / 3.0)
+    assert result.failure_probability == pytest.approx(escape, rel=RELATIVE)
+
+
+def test_one_result_has_the_same_bits_as_many_with_any_number_of_threads():
+    rows, slopes = walker(12, 0.8)
+    mesh = mesh_of(*lifted(rows, len(slopes), 243), slopes)
+    sigmas = np.radians(np.linspace(1.0, 5.0, 7))
+    assert len(mesh.states) * len(slopes) * len(sigmas) > markov._WORTH_THREADS
+    alone = [metastability(mesh, 0.01, sigma) for sigma in sigmas]
+    for threads in (1, 2, 3, None):
+        found = metastabilities(mesh, 0.01, sigmas, threads=threads)
+        for one, other in zip(alone, found, strict=True):
+            assert_same_bits(one, other)
+
+
+def test_columns_that_settle_at_different_times_do_not_mix():
+    # One survives no step, one no second; one never falls; the others are done at their own time.
+    rows = [[2, 0, 0, 1], [3, 0, 1, 1], [0, 0, 1, 2]]
+    targets = np.array([[0] * 4, *rows], dtype=np.uint32)
+    outcomes = np.where(targets == 0, 9, 0).astype(np.uint8)
+    outcomes[0] = NOT_SIMULATED
+    columns = np.array(
+        [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0.5, 0.5], [0.1, 0.2, 0.3, 0.4]]
+    )
+    found = markov._solve(targets, outcomes, np.ascontiguousarray(columns.T))
+    assert [found[0].mfpt, found[1].mfpt, found[2].mfpt] == [1.0, 1.0, math.inf]
+    for p, result in zip(columns, found, strict=True):
+        assert_same_bits(result, solve_chain(targets, outcomes, p))
+
+
+def test_fall_back_of_one_column_leaves_the_others(monkeypatch):
+    # At the second distribution the two gaits hardly ever change: not iterated.
+    rows = [[1, 0, 1, 2], [2, 2, 0, 2]]
+    targets = np.array([[0] * 4, *rows], dtype=np.uint32)
+    outcomes = np.where(targets == 0, 9, 0).astype(np.uint8)
+    outcomes[0] = NOT_SIMULATED
+    columns = np.array([[0.4, 0.1, 0.2, 0.3], [1.0 - 3e-9, 1e-9, 1e-12, 2e-9]])
+    found = markov._solve(targets, outcomes, np.ascontiguousarray(columns.T))
+    for p, result in zip(columns, found, strict=True):
+        assert relative(result.mfpt, 1 / exact_failure_probability(rows, p)) < RELATIVE
+
+
+def test_progress_is_reported(monkeypatch):
+    monkeypatch.setattr(iteration, "_CALL_SECONDS", 0.0)
+    rows, slopes = walker(12, 0.8)
+    mesh = mesh_of(*lifted(rows, len(slopes), 81), slopes)
+    calls = []
+    found = metastabilities(
+        mesh,
+        0.0,
+        np.radians(np.linspace(1.0, 4.0, 40)),
+        threads=1,
+        on_progress=lambda *a: calls.append(a),
+    )
+    solved, steps, missing = zip(*calls, strict=True)
+    assert list(solved) == sorted(solved)
+    assert solved[0] == 0
+    assert solved[-1] == 20
+    assert steps[:3] == (4, 8, 12)
+    assert missing[0] > 1e-3
+    assert_same_bits(found[0], metastability(mesh, 0.0, math.radians(1.0)))
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "field"), [([0.1, 0.0], r"sigma_s\[1\]"), ([math.nan], r"sigma_s\[0\]")]
+)
+def test_a_wrong_sigma_among_many_is_named(sigmas, field):
+    mesh = mesh_of([[0, 0], [1, 0]], [[NOT_SIMULATED] * 2, [0, 1]], np.array([0.0, 0.1]))
+    assert metastabilities(mesh, 0.0, []) == []
+    with pytest.raises(InputError, match=f"^{field}"):
+        metastabilities(mesh, 0.0, sigmas)
+    with pytest.raises(InputError, match=r"^mu_s"):
+        metastabilities(mesh, 1.0, [0.1])
+
+
 # Properties -------------------------------------------------------------------------------------
 
 
@@ -545,18 +696,7 @@ def test_one_mesh_serves_any_distribution():
     targets = np.array([[0] * len(slopes), *rows])
     outcomes = np.where(targets == 0, 6, 0)
     outcomes[0] = NOT_SIMULATED
-    n = len(targets)
-    mesh = Mesh(
-        slopes=slopes,
-        states=np.zeros((n, 10)),
-        preceding=np.zeros(n),
-        generation=np.zeros(n),
-        targets=targets,
-        outcomes=outcomes,
-        scales=np.ones(10),
-        threshold=0.1,
-        clustered=True,
-    )
+    mesh = mesh_of(targets, outcomes, slopes)
     before = math.inf
     for sigma_deg in (0.5, 1.0, 2.0, 4.0):
         p = slope_probabilities(slopes, 0.0, math.radians(sigma_deg))

@@ -14,38 +14,18 @@ probability is ever found by subtraction. It asks more of phi than a small norm 
 falls may come from states with phi_i = 1e-20, so every component has to be right relative to
 itself.
 
-Iteration
-    phi is the limit of the distribution after k steps, given no fall so far. It is made of sums of
-    products that are not negative, and so accurate in every component. The steps start from a
-    likely state, and every other state gets its weight by flow from there. So a slow part of the
-    chain shows: while it still fills, its weight changes by 1/k or more in step k; after that,
-    what is missing of it after k steps is at most about k times what step k changed. Hence the
-    rule to stop: k times the largest relative change is within the tolerance. A state that lost
-    weight to below what could matter for the sum above is left out, but one that gains never is.
-
-Squaring
-    Chains that mix too slowly for that (walkers with several gaits and rare changes between
-    them), that have a long period, or several closed parts, are solved if they are small: the
-    matrix of 2^k steps is squared until it settles, again from what is not negative. The falls
-    in 2^k steps are carried along, so that rounding in what survives passes neither for falls nor
-    for gain.
-
-The mean first-passage times from each state, (I - Q)^-1 1, are iterated in the same way, or found
-by elimination without subtractions [1]_ [2]_: rows of I - Q are kept as off-diagonals and row sums
-f_i, and the diagonal is the sum of these.
-
-References
-----------
-.. [1] W. K. Grassmann, M. I. Taksar, D. P. Heyman, "Regenerative analysis and steady state
-   distributions for Markov chains", Operations Research 33 (1985).
-.. [2] A. S. Alfa, J. Xue, Q. Ye, "Accurate computation of the smallest eigenvalue of a diagonally
-   dominant M-matrix", Mathematics of Computation 71 (2002).
+phi is the limit of the distribution after k steps, given no fall so far, and is iterated so (see
+`iteration`, where the rule to stop is justified). That is made of sums of products that are not
+negative, and so accurate in every component. Chains that mix too slowly for that, have a long
+period, or several closed parts, are solved if they are small (see `elimination`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -53,8 +33,9 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from biped_mfpt_ros.chain import iteration
+from biped_mfpt_ros.chain.elimination import eliminated_times, squared_distribution
 from biped_mfpt_ros.chain.mesh import Mesh, check_transitions, checked_array
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
@@ -66,11 +47,12 @@ DENSE_LIMIT = 2000
 TOLERANCE = 1e-12
 """Relative accuracy aimed at, in the MFPT and in every state's weight."""
 
-_PLAIN_STEPS = 100  # then steps with a share of staying, for periodic chains
 _STEPS = 3000
-_SQUARINGS = 1100  # 2^1100 is more than any MFPT
-# Weights below this may have lost digits to underflow, and are not waited for.
-_UNDERFLOW = 1e-290
+_MOST_COLUMNS = 32  # solved together: more would not be faster, and take more memory
+_ASIDE_STEPS = 1000
+# Times in a step's weight that count as visited again and again.
+_OFTEN = 0.1
+_WORTH_THREADS = 1_000_000  # transitions times columns
 # Largest ratio of the parts of a sum to the sum itself: three of sixteen digits lost.
 _CANCELLATION = 1e3
 
@@ -181,367 +163,6 @@ def transition_matrix(targets: ArrayLike, probabilities: ArrayLike) -> csr_array
     return matrix
 
 
-# One step of the chain, without a matrix --------------------------------------------------------
-
-
-@kernel
-def _step_forward(targets, probabilities, x, out):
-    """`out` = x T for a distribution x; what falls goes to out[0]. x[0] does not count."""
-    out[:] = 0.0
-    for i in range(1, targets.shape[0]):
-        weight = x[i]
-        if weight > 0.0:
-            for s in range(targets.shape[1]):
-                out[targets[i, s]] += weight * probabilities[s]
-
-
-@kernel
-def _step_backward(targets, probabilities, x, out):
-    """`out` = T x for a function x of the state, with 0 for the failure state."""
-    out[0] = 0.0
-    for i in range(1, targets.shape[0]):
-        total = 0.0
-        for s in range(targets.shape[1]):
-            if targets[i, s] != 0:
-                total += probabilities[s] * x[targets[i, s]]
-        out[i] = total
-
-
-@kernel
-def _settle(x, out, total, stay, floor):
-    """Replace x, of sum 1, by out + stay * x, scaled to sum 1; return the largest relative change.
-
-    `total` is the sum of `out`; index 0 does not count in either, nor do components that shrink
-    and are below `floor`.
-    """
-    largest = 0.0
-    for i in range(1, x.shape[0]):
-        value = (out[i] + stay * x[i]) / (total + stay)
-        change = value - x[i]
-        if value > _UNDERFLOW and (change > 0.0 or value > floor):
-            largest = max(largest, abs(change) / value)
-        x[i] = value
-    return largest
-
-
-@kernel
-def _weight_by_outcome(targets, outcomes, probabilities, x, out):
-    """out[code] = probability that a step from distribution x falls with that outcome code."""
-    for i in range(1, targets.shape[0]):
-        if x[i] > 0.0:
-            for s in range(targets.shape[1]):
-                if targets[i, s] == 0:
-                    out[outcomes[i, s]] += x[i] * probabilities[s]
-
-
-# Who can reach whom -----------------------------------------------------------------------------
-
-
-@kernel
-def _reachable(targets, start, out, queue):
-    """Mark in `out` the states that can be reached from `start`, itself included."""
-    out[start] = True
-    queue[0] = start
-    waiting = 1
-    while waiting > 0:
-        waiting -= 1
-        i = queue[waiting]
-        for s in range(targets.shape[1]):
-            j = targets[i, s]
-            if not out[j]:
-                out[j] = True
-                queue[waiting] = j
-                waiting += 1
-
-
-@kernel
-def _can_reach(targets, out):
-    """Mark in `out` also the states from which one can reach those already marked."""
-    changed = True
-    while changed:
-        changed = False
-        for i in range(targets.shape[0] - 1, 0, -1):
-            if not out[i]:
-                for s in range(targets.shape[1]):
-                    if out[targets[i, s]]:
-                        out[i] = True
-                        changed = True
-                        break
-
-
-# Small chains -----------------------------------------------------------------------------------
-
-
-def _check_size(states: int) -> None:
-    if states > DENSE_LIMIT:
-        raise ChainError(
-            f"the chain does not settle in {_STEPS} steps, and with {states} states it is too "
-            f"large to be solved otherwise (limit {DENSE_LIMIT})"
-        )
-
-
-def _squared(q: np.ndarray, falls: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Limit of the distribution after 2^k steps from any of the states `among`, given no fall.
-
-    `falls` is what leaves Q, shape (n,). The limit has to be the same from each of `among`, which
-    are the states of a class, so that the first steps do not decide between slow parts.
-    """
-    n = len(q)
-    # With every other step one of staying there are no periods.
-    power, left = 0.5 * (q + np.eye(n)), 0.5 * falls
-    x = np.full(n, 1.0 / n)
-    for _ in range(_SQUARINGS):
-        power, left = power @ power, left + power @ left
-        survives = power.sum(axis=1)
-        rare = left < 0.5
-        power[rare] *= ((1.0 - left[rare]) / survives[rare])[:, np.newaxis]
-        if survives.max() < 1e-100:
-            power /= survives.max()
-        sums = power[among].sum(axis=1)[:, np.newaxis]
-        if not sums.all():
-            raise ChainError("probabilities of the chain are too small to be told from zero")
-        rows = power[among] / sums
-        previous, x = x, rows[0]
-        floor = TOLERANCE / n * float(x @ falls)
-        # A slow part that still fills doubles its weight, what is missing of it is squared.
-        counts = (x > _UNDERFLOW) & ((x > previous) | (x > floor))
-        if (np.abs(previous - x)[counts] <= TOLERANCE * x[counts]).all():
-            counts = (x > _UNDERFLOW) & (x > floor)
-            if (np.abs(rows - x)[:, counts] <= TOLERANCE * x[counts]).all():
-                return x
-    raise ChainError(f"a chain of {n} states does not settle in 2^{_SQUARINGS} steps")
-
-
-def _dense_distribution(targets: np.ndarray, probabilities: np.ndarray, start: int) -> np.ndarray:
-    """Metastable distribution of a small chain, from its classes of states that reach each other.
-
-    lambda_2 is the largest of the classes' eigenvalues, and phi the limit of the distribution
-    from a state of that class.
-    """
-    reached = _mark_reachable(targets, start)
-    reached[0] = False
-    members = np.flatnonzero(reached)
-    _check_size(len(members))
-    rows = transition_matrix(targets, probabilities)[members]
-    matrix, falls = rows[:, members].toarray(), rows[:, [0]].toarray().ravel()
-    graph = csr_array(matrix)
-    count, labels = connected_components(graph, connection="strong")
-    classes = [np.flatnonzero(labels == label) for label in range(count)]
-    keys, vectors = [], []
-    for states in classes:
-        leaves = falls[states] + matrix[states][:, labels != labels[states[0]]].sum(axis=1)
-        q = matrix[np.ix_(states, states)]
-        x = _squared(q, leaves, np.arange(len(states))) if q.any() else np.ones(1)
-        # Near 1 the rates no longer tell small eigenvalues apart; what stays does.
-        keys.append((float(x @ leaves), -float((x @ q).sum())))
-        vectors.append(x)
-    best = min(range(count), key=keys.__getitem__)
-    while True:
-        below = np.sort(breadth_first_order(graph, classes[best][0], return_predecessors=False))
-        # Of equal classes one behind the other, the last one keeps all the weight.
-        behind = [c for c in set(labels[below]) if c != best and keys[c] == keys[best]]
-        if not behind:
-            break
-        best = behind[0]
-    x = vectors[best]
-    if len(below) > len(x):
-        among = np.searchsorted(below, classes[best])
-        x = _squared(matrix[np.ix_(below, below)], falls[below], among)
-    out = np.zeros(len(targets))
-    out[members[below]] = x
-    return out
-
-
-@kernel
-def _eliminate(q, falls, x):
-    """Replace x by (I - Q)^-1 x without subtracting; `q` and `falls` are used up.
-
-    The diagonal of `q` is not read. States are eliminated from the last to the first: a visit to
-    one is followed on to where it leads among those that are left, or to the fall.
-    """
-    for p in range(q.shape[0] - 1, -1, -1):
-        leaves = falls[p]
-        for j in range(p):
-            leaves += q[p, j]
-        for j in range(p):
-            q[p, j] /= leaves
-        falls[p] /= leaves
-        x[p] /= leaves
-        for i in range(p):
-            share = q[i, p]
-            if share != 0.0:
-                falls[i] += share * falls[p]
-                x[i] += share * x[p]
-                for j in range(p):
-                    q[i, j] += share * q[p, j]
-    for p in range(1, q.shape[0]):
-        for j in range(p):
-            x[p] += q[p, j] * x[j]
-
-
-def _eliminated_times(
-    targets: np.ndarray, probabilities: np.ndarray, among: np.ndarray
-) -> np.ndarray:
-    """Mean first-passage times of the states `among`, which lead only to each other and to 0."""
-    members = np.flatnonzero(among)
-    _check_size(len(members))
-    rows = transition_matrix(targets, probabilities)[members]
-    times = np.ones(len(members))
-    _eliminate(rows[:, members].toarray(), rows[:, [0]].toarray().ravel(), times)
-    out = np.zeros(len(targets))
-    out[members] = times
-    return out
-
-
-# Iteration --------------------------------------------------------------------------------------
-
-
-def _mark_reachable(targets: np.ndarray, start: int) -> np.ndarray:
-    out = np.zeros(len(targets), dtype=np.bool_)
-    _reachable(targets, start, out, np.empty(len(targets), dtype=np.int64))
-    return out
-
-
-Step = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]
-Floor = Callable[[np.ndarray, float], float]
-
-
-def _iterate(
-    step: Step,
-    targets: np.ndarray,
-    probabilities: np.ndarray,
-    start: int,
-    floor: Floor,
-    tolerance: float = TOLERANCE,
-) -> np.ndarray | None:
-    """Repeat a step from `start`, scaled to sum 1, until it settles; None if it does not.
-
-    ``floor(out, total)`` is the size below which a component that shrinks does not matter, from
-    what a step gave and its sum without out[0]. Returns the last non-zero vector where a step
-    leaves nothing (lambda_2 = 0).
-    """
-    x, out = np.zeros(len(targets)), np.empty(len(targets))
-    x[start] = 1.0
-    previous = math.inf
-    for k in range(1, _STEPS + 1):
-        step(targets, probabilities, x, out)
-        # Summed in pairs by NumPy: rounding that differs from step to step would look like change.
-        total = float(out[1:].sum())
-        if total == 0.0:
-            return x
-        stay = 0.0 if k <= _PLAIN_STEPS else 0.5 * total
-        change = _settle(x, out, total, stay, floor(out, total))
-        # Two in a row, as parts that oscillate may stand still for a moment.
-        if k * max(change, previous) <= tolerance:
-            return x
-        previous = change
-    return None
-
-
-def _iterated_distribution(
-    targets: np.ndarray, probabilities: np.ndarray, start: int, endless: bool
-) -> np.ndarray | None:
-    """Metastable distribution by iteration, None if it does not settle.
-
-    The state `start` may never be visited again, and its first steps may share weight out
-    between parts of the chain in a way that later steps are too slow to put right. So it only
-    finds the likeliest state, and phi is iterated from there: whatever part is not in balance
-    with a state that is always visited is seen to fill.
-    """
-    n = len(targets)
-
-    def floor(out: np.ndarray, total: float) -> float:
-        return TOLERANCE / n * (1.0 if endless else float(out[0]) / (float(out[0]) + total))
-
-    rough = _iterate(_step_forward, targets, probabilities, start, floor, tolerance=1e-3)
-    if rough is None:
-        return None
-    likeliest = int(np.argmax(rough))
-    phi = _iterate(_step_forward, targets, probabilities, likeliest, floor)
-    if phi is None or n * phi[likeliest] < 0.1:
-        return None
-    # No part that is reached from the start, but not from there, may have a larger eigenvalue.
-    aside = _mark_reachable(targets, start) & ~_mark_reachable(targets, likeliest)
-    if not aside.any() or endless:
-        return phi
-    out = np.empty(n)
-    _step_forward(targets, probabilities, phi, out)
-    lambda_2 = float(out[1:].sum())
-    survives = aside.astype(np.float64)
-    bound = 1.0 - 1e-9  # well above what rounding adds to a survival of 1
-    for _ in range(_PLAIN_STEPS if lambda_2 > 0.01 else 0):  # 0.01^100 does not underflow
-        _step_backward(targets, probabilities, survives, out)
-        survives = np.where(aside, out, 0.0)
-        bound *= lambda_2
-        # The largest of the survivals of k steps is at least the eigenvalue to the power of k.
-        if survives.max() <= bound:
-            return phi
-    return None
-
-
-def _iterated_times(
-    targets: np.ndarray,
-    probabilities: np.ndarray,
-    among: np.ndarray,
-    phi: np.ndarray,
-    escape: float,
-) -> np.ndarray | None:
-    """Mean first-passage times m of the states `among`; None if iteration does not settle.
-
-    m = (I - Q)^-1 1 is split with the right eigenvector psi of lambda_2, phi psi = 1: what starts
-    in state i is worth psi_i of the metastable distribution, hence
-
-        m = psi / (1 - lambda_2) + sum over k of Q^k (1 - psi),
-
-    where phi (1 - psi) = 0, so the series forgets as fast as the chain does and is of the size
-    of that time, however large the first term. psi comes from the likeliest state just as phi
-    does. With `escape` 0 all is in the series, which then has no negative term. It is
-    also taken where the two parts nearly cancel: states that outlive the metastable ones by far
-    but only for a few steps, which needs a small lambda_2.
-    """
-    n = len(targets)
-    psi = np.zeros(n)
-    if escape > 0.0:
-        likeliest = int(np.argmax(phi))
-
-        def floor(out: np.ndarray, total: float) -> float:
-            # Below this, psi / escape is within the tolerance of the first step alone.
-            return TOLERANCE * escape * float(phi @ out) / total
-
-        found = _iterate(_step_backward, targets, probabilities, likeliest, floor)
-        if found is None:
-            return None
-        # 0 where nothing settles at all, and tiny where psi is that of states out of x_2's reach.
-        overlap = float(phi @ found)
-        if overlap < _UNDERFLOW:
-            return _iterated_times(targets, probabilities, among, phi, 0.0)
-        psi = found / overlap
-    rest = np.where(among, 1.0 - psi, 0.0)
-    first = np.zeros(n)
-    with np.errstate(over="ignore"):
-        np.divide(psi, escape, out=first, where=psi > 0.0)
-    series = np.zeros(n)
-    out = np.empty(n)
-    for k in range(1, _STEPS + 1):
-        largest = float(np.max(np.abs(rest) / np.maximum(first + series, 1.0)))
-        if k * largest <= TOLERANCE:
-            times = first + series
-            if (first > _CANCELLATION * times).any():
-                return _iterated_times(targets, probabilities, among, phi, 0.0)
-            return times
-        _step_backward(targets, probabilities, rest, out)
-        if k <= _PLAIN_STEPS:
-            series += rest
-            rest, out = out, rest
-        else:
-            # (I - Q)^-1 = (I - (I + Q) / 2)^-1 / 2
-            series += 0.5 * rest
-            rest = 0.5 * (rest + out)
-        # phi rest = 0 but for rounding, which would stay for ever.
-        rest -= psi * (phi @ rest)
-    return None
-
-
 # Results ----------------------------------------------------------------------------------------
 
 
@@ -592,63 +213,354 @@ class Metastability:
             If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
         """
         targets, probabilities = self._targets, self._probabilities
-        endless = ~_mark_can_fall(targets)
-        _can_reach(targets, endless)
+        slopes = np.flatnonzero(probabilities)
+        endless = ~iteration.can_fall(targets, slopes)
+        iteration.can_reach(targets, slopes, endless)
         among = ~endless
         among[0] = False
         escape = 0.0 if endless.any() else self.failure_probability
         times = _iterated_times(targets, probabilities, among, self.distribution, escape)
         if times is None:
-            times = _eliminated_times(targets, probabilities, among)
+            members = np.flatnonzero(among)
+            times = np.zeros(len(targets))
+            times[members] = eliminated_times(*_dense(targets, probabilities, members))
         times[endless] = math.inf
         times.flags.writeable = False
         return times
 
 
-def _mark_can_fall(targets: np.ndarray) -> np.ndarray:
-    out = np.zeros(len(targets), dtype=np.bool_)
-    out[0] = True
-    _can_reach(targets, out)
-    return out
+def _iterated_times(
+    targets: np.ndarray,
+    probabilities: np.ndarray,
+    among: np.ndarray,
+    phi: np.ndarray,
+    escape: float,
+) -> np.ndarray | None:
+    """Mean first-passage times m of the states `among`; None if iteration does not settle.
 
+    m = (I - Q)^-1 1 is split with the right eigenvector psi of lambda_2, phi psi = 1: what starts
+    in state i is worth psi_i of the metastable distribution, hence
 
-def _solve(targets: np.ndarray, outcomes: np.ndarray, probabilities: np.ndarray) -> Metastability:
-    possible = probabilities > 0.0
-    if not possible.all():
-        targets, outcomes = targets[:, possible], outcomes[:, possible]
-        probabilities = probabilities[possible]
-    targets, outcomes = np.ascontiguousarray(targets), np.ascontiguousarray(outcomes)
+        m = psi / (1 - lambda_2) + sum over k of Q^k (1 - psi),
+
+    where phi (1 - psi) = 0, so the series forgets as fast as the chain does and is of the size
+    of that time, however large the first term. psi comes from the likeliest state just as phi
+    does. With `escape` 0 all is in the series, which then has no negative term. It is
+    also taken where the two parts nearly cancel: states that outlive the metastable ones by far
+    but only for a few steps, which needs a small lambda_2.
+    """
     n = len(targets)
-
-    start = 1
-    can_fall = _mark_can_fall(targets)
-    endless = False
-    if not can_fall.all():
-        safe = _mark_reachable(targets, 1) & ~can_fall
-        if safe.any():
-            start = int(np.argmax(safe))
-            endless = True
-
-    phi = _iterated_distribution(targets, probabilities, start, endless)
-    if phi is None:
-        phi = _dense_distribution(targets, probabilities, start)
-    phi.flags.writeable = False
-
+    psi = np.zeros(n)
+    if escape > 0.0:
+        settled = iteration.settle(
+            iteration.outgoing(targets, np.flatnonzero(probabilities)),
+            probabilities[:, np.newaxis],
+            np.array([np.argmax(phi)]),
+            # Below this, psi / escape is within the tolerance of the first step alone.
+            phi[:, np.newaxis],
+            np.array([TOLERANCE * escape]),
+            TOLERANCE,
+            _STEPS,
+        )
+        if not settled.done[0]:
+            return None
+        found = settled.vectors[:, 0]
+        # 0 where nothing settles at all, and tiny where psi is that of states out of x_2's reach.
+        overlap = float(phi @ found)
+        if overlap < iteration.UNDERFLOW:
+            return _iterated_times(targets, probabilities, among, phi, 0.0)
+        psi = found / overlap
+    rest = np.where(among, 1.0 - psi, 0.0)
+    first = np.zeros(n)
+    with np.errstate(over="ignore"):
+        np.divide(psi, escape, out=first, where=psi > 0.0)
+    series = np.zeros(n)
     out = np.empty(n)
-    _step_forward(targets, probabilities, phi, out)
-    by_code = np.zeros(256)
-    _weight_by_outcome(targets, outcomes, probabilities, phi, by_code)
-    survives, falls = float(out[1:].sum()), float(by_code.sum())
-    escape = falls / (survives + falls)
-    return Metastability(
-        lambda_2=survives / (survives + falls),
-        failure_probability=escape,
-        mfpt=1.0 / escape if escape > 0.0 else math.inf,
-        distribution=phi,
-        failure_shares={int(code): float(by_code[code] / falls) for code in by_code.nonzero()[0]},
-        _targets=targets,
-        _probabilities=probabilities,
-    )
+    for k in range(1, _STEPS + 1):
+        largest = float(np.max(np.abs(rest) / np.maximum(first + series, 1.0)))
+        if k * largest <= TOLERANCE:
+            times = first + series
+            if (first > _CANCELLATION * times).any():
+                return _iterated_times(targets, probabilities, among, phi, 0.0)
+            return times
+        iteration.step_backward(targets, probabilities, rest, out)
+        if k <= iteration.PLAIN_STEPS:
+            series += rest
+            rest, out = out, rest
+        else:
+            # (I - Q)^-1 = (I - (I + Q) / 2)^-1 / 2
+            series += 0.5 * rest
+            rest = 0.5 * (rest + out)
+        # phi rest = 0 but for rounding, which would stay for ever.
+        rest -= psi * (phi @ rest)
+    return None
+
+
+# Metastable distribution ------------------------------------------------------------------------
+
+OnProgress = Callable[[int, int, float], object]
+
+
+@kernel
+def _survive(targets, probabilities, rows, x, out):
+    """out[rows] = probability to get in one step where x counts, for a function x of the state."""
+    for k in range(rows.shape[0]):
+        total = 0.0
+        for s in range(targets.shape[1]):
+            total += probabilities[s] * x[targets[rows[k], s]]
+        out[rows[k]] = total
+
+
+def _dense(
+    targets: np.ndarray, probabilities: np.ndarray, members: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Q among some states, which lead only to each other and to 0, and what falls from them."""
+    if len(members) > DENSE_LIMIT:
+        raise ChainError(
+            f"the chain does not settle in {_STEPS} steps, and with {len(members)} states it is "
+            f"too large to be solved otherwise (limit {DENSE_LIMIT})"
+        )
+    rows = transition_matrix(targets, probabilities)[members]
+    return rows[:, members].toarray(), rows[:, [0]].toarray().ravel()
+
+
+class _Solver:
+    """Chains over one mesh that differ in the probabilities of the slopes, by column."""
+
+    def __init__(
+        self, targets: np.ndarray, outcomes: np.ndarray, probabilities: np.ndarray
+    ) -> None:
+        self.targets = targets
+        self.outcomes = outcomes
+        self.probabilities = probabilities
+        self.structure = iteration.incoming(targets, np.flatnonzero(probabilities.any(axis=1)))
+        # Where a slope has no probability at all, others can be reached, or no fall.
+        self.slopes = [np.flatnonzero(p) for p in probabilities.T]
+        known: dict[bytes, int] = {}
+        for slopes in self.slopes:
+            if slopes.tobytes() not in known:
+                known[slopes.tobytes()] = self._safe(slopes)
+        self.safe = np.array([known[slopes.tobytes()] for slopes in self.slopes])
+
+    def _safe(self, slopes: np.ndarray) -> int:
+        """A state that can be reached from x_2 and from which no fall can; 0: there is none."""
+        can_fall = iteration.can_fall(self.targets, slopes)
+        if can_fall.all():
+            return 0
+        return int(np.argmax(iteration.reachable(self.targets, slopes, 1) & ~can_fall))
+
+    def iterate(
+        self, columns: np.ndarray, begin: np.ndarray, on_steps: iteration.OnSteps | None
+    ) -> iteration.Settled:
+        """Iterate the distributions of some columns from some states."""
+        n = len(self.targets)
+        p = np.ascontiguousarray(self.probabilities[:, columns])
+        weights = np.zeros((n, len(columns)))
+        iteration.fall_probabilities(self.targets, p, weights)
+        weights[:, self.safe[columns] > 0] = 1.0
+        factors = np.full(len(columns), TOLERANCE / n)
+        return iteration.settle(
+            self.structure, p, begin, weights, factors, TOLERANCE, _STEPS, on_steps
+        )
+
+    def distributions(self, columns: np.ndarray, on_steps: iteration.OnSteps | None) -> np.ndarray:
+        """Metastable distributions of some columns, shape (n, columns).
+
+        A state that is hardly ever visited again would not do to begin with: its first steps may
+        share weight out between parts of the chain in a way that later steps are too slow to put
+        right. So a result counts if the state that it began with is likely in it: whatever part is
+        not in balance with a state that is always visited is seen to fill. Mostly x_2 is such a
+        state; else the likeliest one is tried, and then the likeliest of those aside of it.
+        """
+        n = len(self.targets)
+        out = np.empty((n, len(columns)))
+        begin = np.maximum(self.safe[columns], 1)
+        left, unsettled = np.arange(len(columns)), []
+        rough = None
+        for _ in range(3):
+            found = self.iterate(columns[left], begin[left], on_steps)
+            if rough is None:
+                rough = found.vectors
+            again = []
+            for phi, done, c in zip(found.vectors.T, found.done, left, strict=True):
+                candidates = rough[:, c]
+                if done and n * phi[begin[c]] >= _OFTEN:
+                    aside = self._aside(columns[c], begin[c], phi)
+                    if aside is None:
+                        out[:, c] = phi
+                        continue
+                    candidates = np.where(aside, candidates, 0.0)
+                likeliest = int(np.argmax(candidates))
+                if likeliest in (0, begin[c]):
+                    unsettled.append(c)
+                else:
+                    begin[c] = likeliest
+                    again.append(c)
+            left = np.array(again, dtype=np.int64)
+            if not len(left):
+                break
+        for c in [*unsettled, *left]:
+            out[:, c] = self._squared(columns[c])
+        return out
+
+    def _aside(self, column: int, begin: int, phi: np.ndarray) -> np.ndarray | None:
+        """States reached from x_2 but not from `begin`, if they may have a larger eigenvalue.
+
+        `phi` is the metastable distribution of those that are reached from `begin`.
+        """
+        if begin == 1 or self.safe[column]:
+            return None
+        slopes, p = self.slopes[column], self.probabilities[:, column]
+        aside = iteration.reachable(self.targets, slopes, 1)
+        aside &= ~iteration.reachable(self.targets, slopes, begin)
+        rows = np.flatnonzero(aside)
+        if not len(rows):
+            return None
+        _, survives = self._account(np.array([column]), phi[:, np.newaxis])
+        lambda_2 = survives[0]
+        x, out = aside.astype(np.float64), np.zeros(len(phi))
+        for _ in range(_ASIDE_STEPS if lambda_2 > 0.0 else 0):
+            _survive(self.targets, p, rows, x, out)
+            out /= lambda_2
+            x, out = out, x
+            # The largest survival of k steps is at least the eigenvalue to the power of k. By more
+            # than rounding adds to a survival of 1:
+            if x.max() <= 1.0 - 1e-9:
+                return None
+        return aside
+
+    def _squared(self, column: int) -> np.ndarray:
+        """Metastable distribution of one column, if the chain is small."""
+        p = self.probabilities[:, column]
+        members = iteration.reachable(self.targets, self.slopes[column], max(1, self.safe[column]))
+        members[0] = False
+        q, falls = _dense(self.targets, p, np.flatnonzero(members))
+        phi = squared_distribution(q, falls, TOLERANCE)
+        if phi is None:
+            raise ChainError(f"a chain of {len(q)} states does not settle when squared")
+        out = np.zeros(len(self.targets))
+        out[members] = phi
+        return out
+
+    def _account(self, columns: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Falls by outcome code, (codes, columns), and survival, (columns,), of a step from phi."""
+        by_code = np.zeros((int(self.outcomes[1:].max()) + 1, len(columns)))
+        survives = np.zeros(len(columns))
+        p = np.ascontiguousarray(self.probabilities[:, columns])
+        iteration.account(self.targets, self.outcomes, p, phi, by_code, survives)
+        return by_code, survives
+
+    def solve(self, columns: np.ndarray, on_steps: iteration.OnSteps | None) -> list[Metastability]:
+        """Metastability of some columns."""
+        phi = self.distributions(columns, on_steps)
+        by_code, survives = self._account(columns, phi)
+        out = []
+        for c, column in enumerate(columns):
+            falls = float(by_code[:, c].sum())
+            total = float(survives[c]) + falls
+            distribution = phi[:, c].copy()
+            distribution.flags.writeable = False
+            out.append(
+                Metastability(
+                    lambda_2=float(survives[c]) / total,
+                    failure_probability=falls / total,
+                    mfpt=total / falls if falls > 0.0 else math.inf,
+                    distribution=distribution,
+                    failure_shares={
+                        int(code): float(by_code[code, c] / falls)
+                        for code in by_code[:, c].nonzero()[0]
+                    },
+                    _targets=self.targets,
+                    _probabilities=self.probabilities[:, column].copy(),
+                )
+            )
+        return out
+
+
+def _solve(
+    targets: np.ndarray,
+    outcomes: np.ndarray,
+    probabilities: np.ndarray,
+    threads: int | None = None,
+    on_progress: OnProgress | None = None,
+) -> list[Metastability]:
+    """Metastability for each column of `probabilities`, shape (m, columns)."""
+    solver = _Solver(targets, outcomes, probabilities)
+    count = probabilities.shape[1]
+    work = count * len(solver.structure.entries)
+    threads = (threads or os.cpu_count() or 1) if work >= _WORTH_THREADS else 1
+    blocks = np.array_split(np.arange(count), max(-(-count // _MOST_COLUMNS), min(threads, count)))
+    solved = 0
+
+    def on_steps(steps: int, missing: np.ndarray) -> None:
+        if on_progress is not None:
+            on_progress(solved, steps, float(missing.max()))
+
+    def solve(columns: np.ndarray) -> list[Metastability]:
+        nonlocal solved
+        found = solver.solve(columns, on_steps)
+        solved += len(columns)
+        return found
+
+    if threads == 1 or len(blocks) == 1:
+        return [result for block in blocks for result in solve(block)]
+    with ThreadPoolExecutor(threads) as pool:
+        return [result for found in pool.map(solve, blocks) for result in found]
+
+
+def metastabilities(
+    mesh: Mesh,
+    mu_s: float,
+    sigma_s: Sequence[float] | np.ndarray,
+    *,
+    threads: int | None = None,
+    on_progress: OnProgress | None = None,
+) -> list[Metastability]:
+    """Metastability of the chain over a mesh for many spreads of the slope (eq. 30 to 35).
+
+    That takes far less time than one after another. Each result has the same bits as alone, and
+    whatever the number of threads.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The mesh; one serves any number of distributions.
+    mu_s : float
+        Mean slope, rad, within the slope set.
+    sigma_s : sequence of float
+        Standard deviations of the slope, rad, above 0. The slope set should not be much coarser,
+        see `slope_probabilities`.
+    threads : int, optional
+        Most threads; default one for each core. A small chain takes one.
+    on_progress : callable, optional
+        Called every second or so, maybe from several threads, as ``on_progress(solved, steps,
+        missing)``: how many results are there, and of one block that is being iterated the steps
+        taken, and about how much is missing relative to the result: it ends below `TOLERANCE`.
+        An exception from it ends the work and is passed on.
+
+    Returns
+    -------
+    list of Metastability
+        One for each of `sigma_s`, in the same order.
+
+    Raises
+    ------
+    InputError
+        If mu_s or one of sigma_s is not allowed.
+    ChainError
+        If a chain mixes too slowly to be iterated and is too large to be solved otherwise.
+    """
+    columns = []
+    for i, sigma in enumerate(sigma_s):
+        try:
+            columns.append(slope_probabilities(mesh.slopes, mu_s, sigma))
+        except InputError as error:
+            field = f"sigma_s[{i}]" if error.field == "sigma_s" else error.field
+            raise InputError(field, error.value, error.allowed) from None
+    if not columns:
+        return []
+    probabilities = np.ascontiguousarray(np.array(columns).T)
+    return _solve(mesh.targets, mesh.outcomes, probabilities, threads, on_progress)
 
 
 def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
@@ -657,7 +569,7 @@ def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
     Parameters
     ----------
     mesh : Mesh
-        The mesh; one serves any number of distributions.
+        The mesh.
     mu_s : float
         Mean slope, rad, within the slope set.
     sigma_s : float
@@ -675,7 +587,8 @@ def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
     ChainError
         If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
-    return _solve(mesh.targets, mesh.outcomes, slope_probabilities(mesh.slopes, mu_s, sigma_s))
+    probabilities = slope_probabilities(mesh.slopes, mu_s, sigma_s)
+    return _solve(mesh.targets, mesh.outcomes, probabilities[:, np.newaxis])[0]
 
 
 def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLike) -> Metastability:
@@ -702,4 +615,4 @@ def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLik
     targets, probabilities = _check_chain(targets, probabilities)
     outcomes = checked_array("outcomes", outcomes, np.uint8, targets.shape)
     check_transitions(targets, outcomes)
-    return _solve(targets, outcomes, probabilities)
+    return _solve(targets, outcomes, np.ascontiguousarray(probabilities[:, np.newaxis]))[0]
