@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 
 from biped_mfpt_ros.cli import main
-from biped_mfpt_ros.control.controller import paper_controller_names
+from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.report import html
 from biped_mfpt_ros.report.style import Picture
 from biped_mfpt_ros.study import work
@@ -311,12 +312,17 @@ def state():
 
 
 class TestWork:
-    def test_walks_do_not_depend_on_threads(self, state):
+    def test_walks_are_those_of_monte_carlo(self, state):
         settings = {"at_deg": 2.0, "walks": 100, "seed": 1, "tolerance": 1e-7}
         job = Job("walks", "hzd/base", settings)
-        one, two = (work.walks(job, state, threads=n) for n in (1, 2))
-        assert one | {"seconds": 0.0} == two | {"seconds": 0.0}
-        assert one["low"] < one["mean_steps"] < one["high"]
+        found = work.walks(job, state)
+        model = WalkerModel(tolerance=1e-7)
+        walked = monte_carlo(
+            controller("hzd/base"), math.radians(2.0), 100, 1, model=model, state=state
+        )
+        assert found["mean_steps"] == walked.mean_steps
+        assert (found["low"], found["high"]) == walked.confidence_interval
+        assert found["steps"] == walked.steps.sum()
 
     def test_tolerances(self, state):
         settings = {"sigma_deg": 2.0, "walks": 50, "seed": 1, "tolerances": [1e-7, 1e-10]}

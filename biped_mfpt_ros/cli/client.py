@@ -80,6 +80,31 @@ class Client:
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
+    def add(self, make: Callable[..., Node], name: str, **parameters: object) -> Node:
+        """Make a node of this namespace, and serve it too whenever the client waits.
+
+        Parameters
+        ----------
+        make : callable
+            Makes it of the arguments of `rclpy.node.Node`.
+        name : str
+            Of the node.
+        **parameters
+            Its parameters; a value is text as YAML has it.
+        """
+        arguments = ["--ros-args", "-r", f"__ns:={self._node.get_namespace()}"]
+        arguments += ["-r", f"__node:={name}", "-r", "/rosout:=rosout"]
+        for key, value in parameters.items():
+            arguments += ["-p", f"{key}:={value}"]
+        node = make(context=self._context, cli_args=arguments, use_global_arguments=False)
+        self._executor.add_node(node)
+        return node
+
+    def remove(self, node: Node) -> None:
+        """Serve a node no more, and destroy it."""
+        self._executor.remove_node(node)
+        node.destroy_node()
+
     def peers(self) -> Peers:
         """Look who is there."""
         services = self._node.get_service_names_and_types()
@@ -166,10 +191,17 @@ class Client:
         self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]
     ) -> list[MfptEstimate]:
         """Ask the analysis for the MFPT of a mesh at any ``sigma_s``; AnalysisFailed if in vain."""
-        request = ComputeMfpt.Request(
-            mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array(sigma_s), "d")
+        return self.answer(self.ask_mfpt(mesh_id, mu_s, sigma_s))
+
+    def ask_mfpt(self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]) -> Future:
+        """Ask as `compute_mfpt` does, without waiting for the `answer`."""
+        return self._compute.call_async(
+            ComputeMfpt.Request(mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array(sigma_s), "d"))
         )
-        response = self._result(self._compute.call_async(request))
+
+    def answer(self, asked: Future) -> list[MfptEstimate]:
+        """Wait for what `ask_mfpt` asked for; AnalysisFailed if in vain."""
+        response = self._result(asked)
         if not response.success:
             raise AnalysisFailed(f"the analysis failed: {response.message}")
         return list(response.estimates)

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> None:
         compile_all(progress.say)
         progress.say(f"running in {directory}, ROS namespace {namespace}")
         pipeline = Pipeline(processes, progress, namespace)
-        pipeline.record("recorder", directory / "bag")
+        pipeline.record(directory / "bag")
         pipeline.start(workers, args.mean, args.sigma)
         result |= pipeline.mesh(settings, mean, dict(zip(sigmas, args.sigma, strict=True)))
         # The walks can have all cores, and the bag is closed whatever happens to them.
@@ -127,7 +127,7 @@ def _new_directory(output: str | None, name: str) -> Path:
     raise CommandError(f"there are too many directories runs/{name}")
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
     """Text as YAML takes it for text, whatever is in it."""
     return "'" + text.replace("'", "''") + "'"
 
@@ -148,14 +148,13 @@ class Pipeline:
     def __init__(self, processes: Processes, progress: Progress, namespace: str) -> None:
         self._processes = processes
         self._progress = progress
-        self._namespace = namespace
+        self.namespace = namespace
         self._simulators: set[str] = set()
 
-    def record(self, name: str, bag: Path, *, earlier: bool = True) -> Child:
-        """Start a recorder, of what was published before it too if ``earlier``."""
+    def record(self, bag: Path) -> Child:
+        """Start a recorder."""
         # It is stopped last, so that it hears what the others say to the end.
-        quoted = _quoted(str(bag.absolute()))
-        return self._node(name, "recorder", last=True, bag=quoted, earlier=str(earlier).lower())
+        return self._node("recorder", "recorder", last=True, bag=quoted(str(bag.absolute())))
 
     def start(self, workers: int, mean_deg: float, sigma_deg: Sequence[float]) -> None:
         """Start all other nodes."""
@@ -169,10 +168,8 @@ class Pipeline:
         command = [sys.executable, "-m", "biped_mfpt_ros.cli", "node", executable]
         command[-1:-1] = ["--end-with", str(os.getpid())]
         # The log's topic is the same for all nodes on the graph, if it is not brought in here.
-        command += ["--ros-args", "-r", f"__ns:={self._namespace}", "-r", "/rosout:=rosout"]
+        command += ["--ros-args", "-r", f"__ns:={self.namespace}", "-r", "/rosout:=rosout"]
         command += ["--disable-external-lib-logs"]
-        if last:  # there may be several recorders, which must be told apart
-            command += ["-r", f"__node:={name}"]
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         environment = os.environ | {"RCUTILS_COLORIZED_OUTPUT": "0", "PYTHONUNBUFFERED": "1"}
@@ -182,7 +179,7 @@ class Pipeline:
         """Grow the mesh and get its MFPT for each sigma (rad to degrees)."""
         from biped_mfpt_ros.cli.client import Client
 
-        with Client(self._namespace, self.watch) as client:
+        with Client(self.namespace, self.watch) as client:
             client.wait(partial(self.up, client), START_TIMEOUT, "the nodes to come up")
             text = MeshProgress()
 

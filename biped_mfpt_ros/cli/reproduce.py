@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import base64
 import itertools
+import math
 import os
 import shutil
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,8 +23,9 @@ from biped_mfpt_ros.cli import CommandError, options
 from biped_mfpt_ros.cli.kernels import compile_all
 from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text, plain
-from biped_mfpt_ros.cli.pipeline import RESULT_TIMEOUT, START_TIMEOUT, Pipeline
-from biped_mfpt_ros.cli.processes import Child, Processes
+from biped_mfpt_ros.cli.pipeline import RESULT_TIMEOUT, START_TIMEOUT, Pipeline, quoted
+from biped_mfpt_ros.cli.processes import Processes
+from biped_mfpt_ros.cli.workers import workers
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import STEP_MAP
@@ -39,7 +42,8 @@ from biped_mfpt_ros.walker.terrain import slope_set
 
 _MOST_STATES = 200_000
 _RETRY = 0.05  # s
-_SETTLE = 0.2  # s
+_POLL = 0.2  # s
+_PATIENCE = 10.0  # s
 _MOST_TRIES = 3  # for a mesh to be in its bag
 _PRIOR = 60.0  # s of work after which the pace is believed rather than the plan
 _RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
@@ -56,9 +60,9 @@ def reproduce(args: argparse.Namespace) -> None:
         walks=args.walks,
         drawing=drawing() if args.pictures else "",
     )
-    workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
-    if workers < 1:
-        raise InputError("--workers", workers, "a whole number >= 1")
+    number = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
+    if number < 1:
+        raise InputError("--workers", number, "a whole number >= 1")
     require_ros()
     directory = Path(args.output or ("runs/reproduce-quick" if args.quick else "runs/reproduce"))
     store = Store(directory / "results")
@@ -68,9 +72,9 @@ def reproduce(args: argparse.Namespace) -> None:
         if study.missing:
             with Processes(directory / "logs") as processes:
                 compile_all(progress.say)
-                _compute(study, processes, directory, workers)
+                _compute(study, processes, directory, number)
         progress.show("writing the report")
-        report = _write(study, directory, workers, start)
+        report = _write(study, directory, number, start)
     print(json_text(report) if args.json else _text(report, directory))
 
 
@@ -120,7 +124,7 @@ class _Study:
         self.results[job.name] = result
         self.seconds[job.kind] = self.seconds.get(job.kind, 0.0) + seconds
 
-    def show(self, job: Job, details: str = "", share: float = 0.0) -> None:
+    def show(self, job: Job, details: str = "") -> None:
         """Show how far all jobs have come, and what this one of them does."""
         done = len(self.results)
         missing = self.missing
@@ -128,164 +132,186 @@ class _Study:
         ended = [j for j in self.plan.jobs if j.name in self.results][self._before :]
         text = f"{done} of {len(self.plan.jobs)} jobs"
         # What has been done took so much more or less than expected; so will the rest, probably.
-        expected = sum(j.seconds for j in ended) + share * job.seconds
-        left = sum(j.seconds for j in missing) - share * job.seconds
+        expected = sum(j.seconds for j in ended)
+        left = sum(j.seconds for j in missing)
         pace = (elapsed + _PRIOR) / (expected + _PRIOR)
         if ended:
             text += f", {60.0 * len(ended) / elapsed:.3g}/min"
         text += f", about {duration_text(left * pace)} left"
         self.progress.show(f"{text}; {job.title}{': ' if details else ''}{details}")
 
-    def count(self, job: Job) -> Callable[[int, int], None]:
-        """What tells how many of a job's parts are done."""
-        return lambda done, total: self.show(job, f"{100.0 * done / total:.0f} %", done / total)
+
+def _compute(study: _Study, processes: Processes, directory: Path, number: int) -> None:
+    """Do the jobs that are missing: limit cycles, meshes by the pipeline's nodes, all the rest."""
+    with workers(number) as pool:
+        cycles = [job for job in study.missing if job.kind == "cycle"]
+        meshes = [job for job in study.missing if job.kind == "mesh"]
+        started = _start_nodes(study, processes, number) if meshes else None
+        _do(study, pool, [(job, work.cycle, (job,)) for job in cycles])
+        # Without a gait on flat ground there is nothing to start from; the tables say so.
+        walking = {job.controller for job in study.plan.jobs if study.state(job.controller)}
+        if started is not None:
+            _meshes(study, [m for m in meshes if m.controller in walking], started, directory)
+            # The rest can have all cores.
+            study.progress.show("stopping the nodes")
+            processes.stop()
+        rest = [job for job in study.missing if job.controller in walking and job.kind in _DO]
+        # What takes longest comes first, so that all processes end at about the same time.
+        rest.sort(key=lambda job: -job.seconds)
+        _do(study, pool, [(job, *_call(study, job, directory)) for job in rest])
 
 
-def _compute(study: _Study, processes: Processes, directory: Path, workers: int) -> None:
-    """Do the jobs that are missing: cycles, then meshes by the pipeline, then what walks here."""
-    for job in study.missing:
-        if job.kind == "cycle":
-            study.show(job)
-            _timed(study, job, lambda job=job: work.cycle(job))
-    # Without a gait on flat ground there is nothing to start from; the tables say so.
-    jobs = [job for job in study.missing if study.state(job.controller) is not None]
-    meshes = [job for job in jobs if job.kind == "mesh"]
-    if meshes:
-        _meshes(study, meshes, processes, directory, workers)
-    for job in jobs:
-        state = study.state(job.controller)
-        assert state is not None
-        study.show(job)
-        if job.kind == "walks":
-            _timed(study, job, partial(work.walks, job, state, workers, study.count(job)))
-        elif job.kind == "tolerance":
-            _timed(study, job, partial(work.tolerance, job, state, workers, study.count(job)))
-        elif job.kind == "slopes":
-            _timed(study, job, partial(work.slopes, job, state))
-        elif job.kind == "pictures":
-            _timed(study, job, partial(_pictures, study, job, state, directory))
+_DO: dict[str, Callable[..., dict[str, Any]]] = {
+    "walks": work.walks,
+    "tolerance": work.tolerance,
+    "slopes": work.slopes,
+    "pictures": work.pictures,
+}
 
 
-def _timed(study: _Study, job: Job, do: Callable[[], dict[str, Any]]) -> None:
-    start = time.monotonic()
-    result = do()
-    study.finish(job, result, time.monotonic() - start)
+def _call(
+    study: _Study, job: Job, directory: Path
+) -> tuple[Callable[..., dict[str, Any]], tuple[Any, ...]]:
+    """What does a job in a worker, and its arguments."""
+    arguments: tuple[Any, ...] = (job, study.state(job.controller))
+    if job.kind == "pictures":
+        arguments += _mesh_of_pictures(study, job, directory)
+    return _DO[job.kind], arguments
 
 
-def _pictures(study: _Study, job: Job, state: list[float], directory: Path) -> dict[str, Any]:
-    """Draw a controller's gait, and its mesh as the bag has it."""
-    from biped_mfpt_ros.bag import read_meshes
-    from biped_mfpt_ros.report.gallery import gallery
-
-    mesh = None
+def _mesh_of_pictures(study: _Study, job: Job, directory: Path) -> tuple[Path | None, str]:
+    """Bag and name of the finest mesh whose chain could be solved."""
     for grown in reversed(study.plan.of("mesh", job.controller)):
         result = study.results.get(grown.name)
-        # The finest one whose chain could be solved.
         if result and mfpt_of(grown.settings | result, job.settings["sigma_deg"]) is not None:
-            mesh = read_meshes(directory / result["bag"])[result["mesh_id"]].mesh
-            break
-    pictures = gallery(
-        controller(job.controller),
-        readings()[job.controller].model,
-        state,
-        job.settings["sigma_deg"],
-        mesh,
-        animated=job.settings["animated"],
-    )
-    return {
-        "pictures": [
-            {
-                "title": picture.title,
-                "caption": picture.caption,
-                "mime": picture.mime,
-                "data": base64.b64encode(picture.data).decode(),
-            }
-            for picture in pictures
-        ]
-    }
+            return directory / result["bag"], result["mesh_id"]
+    return None, ""
 
 
-@dataclass
-class _Recording:
-    """A mesh that is done but for its bag."""
-
-    job: Job
-    result: dict[str, Any]
-    recorder: Child
-    bag: Path
-    seconds: float
-
-
-def _meshes(
-    study: _Study, jobs: list[Job], processes: Processes, directory: Path, workers: int
+def _do(
+    study: _Study,
+    pool: Executor,
+    calls: Sequence[tuple[Job, Callable[..., dict[str, Any]], tuple[Any, ...]]],
 ) -> None:
-    """Grow meshes with the pipeline's nodes, which are started once, and a recorder for each."""
-    from biped_mfpt_ros.cli.client import Client
+    """Have the workers do jobs, and keep each result when it comes."""
+    given = {pool.submit(_timed, do, arguments): job for job, do, arguments in calls}
+    while given:
+        done, _ = wait(given, _POLL, FIRST_COMPLETED)
+        for future in done:
+            job = given.pop(future)
+            study.finish(job, *future.result())
+        if given:
+            study.show(next(iter(given.values())))
+
+
+def _timed(
+    do: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]
+) -> tuple[dict[str, Any], float]:
+    """Result of a job, in a worker, and the time that this took."""
+    start = time.monotonic()
+    result = do(*arguments)
+    return result, time.monotonic() - start
+
+
+def _start_nodes(study: _Study, processes: Processes, number: int) -> Pipeline:
+    """Start the nodes of the pipeline but the recorders, which come with the meshes."""
     from biped_mfpt_ros.nodes.spin import prepare_environment
 
     prepare_environment()
-    bags = directory / "bags"
-    bags.mkdir(exist_ok=True)
     namespace = f"/reproduce_{os.getpid()}_{time.time_ns() % 10**9}"
     pipeline = Pipeline(processes, study.progress, namespace)
-    started = time.monotonic()
-    published = sorted({s for job in jobs for s in SIGMA_DEG[scheme_of(job.controller)]})
-    pipeline.start(workers, 0.0, published)
-    last: _Recording | None = None
+    pipeline.start(number, 0.0, _published_deg(study))
+    return pipeline
+
+
+@dataclass
+class _Grown:
+    """A mesh that is done but for its MFPT, which the analysis computes meanwhile."""
+
+    job: Job
+    result: dict[str, Any]
+    asked: Any
+    seconds: float
+
+
+def _meshes(study: _Study, jobs: Sequence[Job], pipeline: Pipeline, directory: Path) -> None:
+    """Grow meshes with the pipeline's nodes, and record each in a bag of its own."""
+    from biped_mfpt_ros.cli.client import Client
+    from biped_mfpt_ros.nodes.recorder import Recorder
+
+    start = time.monotonic()
+    bags = directory / "bags"
+    bags.mkdir(exist_ok=True)
+    recorder: Recorder | None = None
+
+    def watch() -> None:
+        pipeline.watch()
+        if recorder is not None and recorder.failed:
+            raise CommandError(f"{bag} cannot be written any more")
+
     queue, tries = deque(jobs), Counter[str]()
-    with Client(namespace, pipeline.watch) as client:
-        while queue or last is not None:
-            job = queue.popleft() if queue else None
-            if job is not None:
-                start = time.monotonic()
-                tries[job.name] += 1
-                name = f"recorder_{tries.total()}"
-                bag = bags / job.name
-                if bag.exists():
-                    shutil.rmtree(bag)  # of a mesh that was stopped, or not heard to its end
-                recorder = pipeline.record(name, bag, earlier=False)
-            # The bag of the mesh before is closed and checked while this recorder starts.
-            if last is not None:
-                problem = _close(study, last)
-                if problem and tries[last.job.name] == _MOST_TRIES:
-                    raise CommandError(f"{last.bag}: the mesh cannot be read back ({problem})")
-                if problem:
-                    queue.append(last.job)
-                last = None
-            if job is None:
+    unsolved: deque[_Grown] = deque()
+    with Client(pipeline.namespace, watch) as client:
+        while queue or unsolved:
+            if unsolved and (unsolved[0].asked.done() or not queue):
+                _solve(study, client, unsolved.popleft())
                 continue
+            job = queue.popleft()
+            tries[job.name] += 1
+            bag = bags / job.name
+            if bag.exists():
+                shutil.rmtree(bag)  # of a mesh that was stopped, or not heard to its end
+            # In this process: it would take a second to start one for each mesh.
+            name = f"recorder_{tries.total()}"
+            recorder = client.add(Recorder, name, bag=quoted(str(bag.absolute())), earlier="false")
             if tries.total() == 1:
                 client.wait(partial(pipeline.up, client), START_TIMEOUT, "the nodes to come up")
-                study.seconds["starting nodes"] = time.monotonic() - started
+                study.seconds["starting nodes"] = time.monotonic() - start
+            began = time.monotonic()
             study.show(job, "starting its recorder")
             client.wait(
                 partial(client.listens, name, _RECORDED), START_TIMEOUT, f"{name} to come up"
             )
-            result = _grow(study, job, client, published)
-            processes.end(recorder)
-            last = _Recording(
-                job,
-                result | {"bag": str(bag.relative_to(directory))},
-                recorder,
-                bag,
-                time.monotonic() - start,
-            )
-    # The walks can have all cores.
-    study.show(jobs[-1], "stopping the nodes")
-    processes.stop()
+            result = _grow(study, job, client)
+            _wait_for_estimates(study, job, client, result["mesh_id"], recorder)
+            recorder.close()
+            client.remove(recorder)
+            recorder = None
+            problem = _missing_in_bag(bag, result["mesh_id"])
+            if not problem:
+                result["bag"] = str(bag.relative_to(directory))
+                asked = client.ask_mfpt(result["mesh_id"], 0.0, _sigmas(job))
+                unsolved.append(_Grown(job, result, asked, time.monotonic() - began))
+            elif tries[job.name] < _MOST_TRIES:
+                queue.append(job)
+            else:
+                raise CommandError(f"{bag}: the mesh cannot be read back ({problem})")
 
 
-def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[str, Any]:
-    """Grow a mesh, and have the analysis compute its MFPT."""
+def _missing_in_bag(bag: Path, mesh_id: str) -> str:
+    """What keeps a mesh from being read out of its bag; empty if nothing does."""
+    from biped_mfpt_ros.bag import read_meshes
+
+    found = read_meshes(bag).get(mesh_id)
+    if found is None:
+        return "it is not there"
+    return "" if found.mesh is not None else found.problem
+
+
+def _sigmas(job: Job) -> list[float]:
+    return [options.spread("sigma", degrees) for degrees in job.settings["sigma_deg"]]
+
+
+def _grow(study: _Study, job: Job, client: Any) -> dict[str, Any]:
+    """Grow a mesh."""
     from biped_mfpt_ros.nodes.messages import MeshSettings
 
-    state = study.state(job.controller)
     settings = MeshSettings(
         controller(job.controller),
         readings()[job.controller].model,
         slope_set(job.settings["slope_step_deg"]),
         job.settings["threshold"],
-        initial_state=np.array(state),
+        initial_state=np.array(study.state(job.controller)),
         max_states=_MOST_STATES,
     )
     text = MeshProgress()
@@ -301,14 +327,6 @@ def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[
 
     study.show(job)
     grown = client.grow_mesh(settings, feedback)
-    estimates = _estimates(study, job, client, grown.mesh_id)
-    # What the analysis publishes comes last: when it is here, the recorder will have it soon.
-    solved = [s for s, e in zip(job.settings["sigma_deg"], estimates, strict=True) if e is not None]
-    first = itertools.takewhile(lambda sigma: sigma in solved, published)
-    client.published_mfpt(
-        grown.mesh_id, 0.0, [options.spread("sigma", deg) for deg in first], RESULT_TIMEOUT
-    )
-    time.sleep(_SETTLE)
     return {
         "mesh_id": grown.mesh_id,
         "states": grown.states,
@@ -317,6 +335,47 @@ def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[
         "swings_per_second": grown.swings / grown.seconds,
         "seconds": grown.seconds,
         "step_map_seconds": grown.step_map_seconds,
+    }
+
+
+def _published_deg(study: _Study) -> list[float]:
+    """Sigmas, degrees, for which the analysis publishes the MFPT of every mesh."""
+    return sorted({s for n in study.plan.controllers for s in SIGMA_DEG[scheme_of(n)]})
+
+
+def _wait_for_estimates(
+    study: _Study, job: Job, client: Any, mesh_id: str, recorder: Any
+) -> None:
+    """Wait until a recorder has what the analysis publishes of a mesh."""
+    sigmas = [options.spread("sigma", degrees) for degrees in _published_deg(study)]
+    study.show(job, "waiting for the analysis")
+    try:
+        client.published_mfpt(mesh_id, 0.0, sigmas, _PATIENCE)
+    except CommandError:
+        # It ends at the first that it cannot compute.
+        solved = itertools.takewhile(
+            lambda sigma_s: _estimate(study, job, client, mesh_id, sigma_s), sigmas
+        )
+        sigmas = list(solved)
+        client.published_mfpt(mesh_id, 0.0, sigmas, RESULT_TIMEOUT)
+    client.wait(
+        lambda: recorder.counts.get("mfpt", 0) >= len(sigmas), RESULT_TIMEOUT, "the recorder"
+    )
+
+
+def _solve(study: _Study, client: Any, grown: _Grown) -> None:
+    """Take the MFPT of a mesh at all its sigmas, and keep the result."""
+    from biped_mfpt_ros.cli.client import AnalysisFailed
+
+    job, result = grown.job, grown.result
+    study.show(job, "waiting for the analysis")
+    try:
+        estimates = client.answer(grown.asked)
+    except AnalysisFailed:  # one of them cannot be computed
+        estimates = [
+            _estimate(study, job, client, result["mesh_id"], sigma_s) for sigma_s in _sigmas(job)
+        ]
+    result |= {
         "mfpt": [e and e.mfpt for e in estimates],
         "failure_probability": [e and e.failure_probability for e in estimates],
         "failure_shares": [
@@ -329,47 +388,25 @@ def _grow(study: _Study, job: Job, client: Any, published: list[float]) -> dict[
             for e in estimates
         ],
     }
+    study.finish(job, result, grown.seconds)
 
 
-def _estimates(study: _Study, job: Job, client: Any, mesh_id: str) -> list[Any]:
-    """MFPT at every sigma of a mesh; None where the chain could not be solved."""
+def _estimate(study: _Study, job: Job, client: Any, mesh_id: str, sigma_s: float) -> Any:
+    """MFPT of a mesh at one sigma; None where the chain cannot be solved."""
     from biped_mfpt_ros.cli.client import AnalysisFailed
 
     deadline = time.monotonic() + RESULT_TIMEOUT
-    out = []
-    for done, sigma_deg in enumerate(job.settings["sigma_deg"]):
-        study.show(job, f"MFPT at {done} of {len(job.settings['sigma_deg'])} sigmas")
-        while True:
-            try:
-                sigma = options.spread("sigma", sigma_deg)
-                out.append(client.compute_mfpt(mesh_id, 0.0, [sigma])[0])
-                break
-            except AnalysisFailed as error:
-                # The last messages of the mesh may still be on their way to the analysis.
-                if "mesh_id" in str(error) and time.monotonic() < deadline:
-                    time.sleep(_RETRY)
-                    continue
-                study.progress.say(f"{job.title}: no MFPT at {sigma_deg:g} degrees: {error}")
-                out.append(None)
-                break
-    return out
-
-
-def _close(study: _Study, recording: _Recording) -> str:
-    """Wait for a recorder to end and keep the result; says what is missing in the bag, if so."""
-    from biped_mfpt_ros.bag import read_meshes
-
-    start = time.monotonic()
-    if recording.recorder.process.wait(RESULT_TIMEOUT) != 0:
-        raise CommandError(
-            f"{recording.recorder.name} {recording.recorder.ending()}:\n"
-            f"{recording.recorder.log_tail()}"
-        )
-    found = read_meshes(recording.bag).get(recording.result["mesh_id"])
-    if found is None or found.mesh is None:
-        return "it is not there" if found is None else found.problem
-    study.finish(recording.job, recording.result, recording.seconds + time.monotonic() - start)
-    return ""
+    while True:
+        try:
+            return client.compute_mfpt(mesh_id, 0.0, [sigma_s])[0]
+        except AnalysisFailed as error:
+            # The last messages of the mesh may still be on their way to the analysis.
+            if "mesh_id" in str(error) and time.monotonic() < deadline:
+                time.sleep(_RETRY)
+                continue
+            degrees = math.degrees(sigma_s)
+            study.progress.say(f"{job.title}: no MFPT at {degrees:g} degrees: {error}")
+            return None
 
 
 # The report -------------------------------------------------------------------------------------

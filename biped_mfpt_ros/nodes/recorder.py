@@ -80,14 +80,19 @@ class Recorder(Node):
     latecomers arrives then, so that nothing on a latched topic is lost to a recorder that starts
     late or again.
 
+    Parameters
+    ----------
+    **options
+        Further arguments of `rclpy.node.Node`, where it shares a process with others.
+
     Raises
     ------
     InputError
         A parameter is not allowed, or the bag exists already.
     """
 
-    def __init__(self) -> None:
-        super().__init__("recorder")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("recorder", **options)
         parameters = Declared(self, RecorderParameters).now
         self.add_on_set_parameters_callback(_veto)
         self._awaited = [*map(self.resolve_topic_name, TOPICS)]
@@ -107,6 +112,12 @@ class Recorder(Node):
         self.create_timer(_LOOK_PERIOD, self._look, clock=steady)
         self.create_timer(parameters.flush_period, self._flush, clock=steady)
         self.get_logger().info(f"recording to {self._bag.path}")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many messages of each topic, by its relative name, are in the bag so far."""
+        inside = self.get_namespace().rstrip("/") + "/"
+        return {topic.name.removeprefix(inside): topic.count for topic in self._bag.topics}
 
     def close(self) -> None:
         """Take what has arrived, close the bag, and report."""

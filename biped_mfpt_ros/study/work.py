@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,6 @@ from biped_mfpt_ros.study.plan import Job
 from biped_mfpt_ros.study.readings import readings
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
-
-Count = Callable[[int, int], None]
 
 _PHASE_OFF = 0.95  # section 6.3: no torque above this phase
 _MOST_STEPS = 20_000  # of a walk
@@ -43,10 +42,8 @@ def cycle(job: Job) -> dict[str, Any]:
     }
 
 
-def walks(
-    job: Job, state: list[float], threads: int | None = None, count: Count | None = None
-) -> dict[str, Any]:
-    """Monte Carlo from the limit cycle, the first step dropped."""
+def walks(job: Job, state: list[float]) -> dict[str, Any]:
+    """Monte Carlo from the limit cycle, the first step dropped; on one core."""
     settings = job.settings
     start = time.perf_counter()
     found = monte_carlo(
@@ -57,8 +54,7 @@ def walks(
         model=replace(readings()[job.controller].model, tolerance=settings["tolerance"]),
         state=state,
         max_steps=_MOST_STEPS,
-        threads=threads,
-        progress=count,
+        threads=1,
     )
     low, high = found.confidence_interval
     shares = sorted(found.failure_shares.items(), key=lambda item: -item[1])
@@ -75,14 +71,12 @@ def walks(
     }
 
 
-def tolerance(
-    job: Job, state: list[float], threads: int | None = None, count: Count | None = None
-) -> dict[str, Any]:
-    """Whether the same walks end alike, whatever the tolerance of the integrator."""
+def tolerance(job: Job, state: list[float]) -> dict[str, Any]:
+    """Whether the same walks end alike, whatever the tolerance of the integrator; on one core."""
     settings = job.settings
     rows, reference = [], None
-    for done, value in enumerate(sorted(settings["tolerances"])):
-        start = time.perf_counter()
+    for value in sorted(settings["tolerances"]):
+        start = time.process_time()
         found = monte_carlo(
             controller(job.controller),
             math.radians(settings["sigma_deg"]),
@@ -90,9 +84,9 @@ def tolerance(
             settings["seed"],
             model=replace(readings()[job.controller].model, tolerance=value),
             state=state,
-            threads=threads,
+            threads=1,
         )
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         reference = reference or found
         same = (found.steps == reference.steps) & (found.outcomes == reference.outcomes)
         rows.append(
@@ -100,11 +94,9 @@ def tolerance(
                 "tolerance": value,
                 "same": float(same.mean()),
                 "mean_steps": found.mean_steps,
-                "milliseconds": 1e3 * seconds * (threads or 1) / int(found.steps.sum()),
+                "milliseconds": 1e3 * seconds / int(found.steps.sum()),
             }
         )
-        if count is not None:
-            count(done + 1, len(settings["tolerances"]))
     return {"rows": rows}
 
 
@@ -171,3 +163,30 @@ def steps_on(
             return {"steps": taken, "fell": outcome.label}
         at, behind = steps.next_states, ahead
     return {"steps": most, "fell": None}
+
+
+def pictures(job: Job, state: list[float], bag: Path | None, mesh_id: str) -> dict[str, Any]:
+    """Draw a controller's gait, and its mesh as a bag has it; without one if that is None."""
+    # What draws takes a second to import, and not every worker draws.
+    from biped_mfpt_ros.bag import read_meshes
+    from biped_mfpt_ros.report.gallery import gallery
+
+    drawn = gallery(
+        controller(job.controller),
+        readings()[job.controller].model,
+        state,
+        job.settings["sigma_deg"],
+        None if bag is None else read_meshes(bag)[mesh_id].mesh,
+        animated=job.settings["animated"],
+    )
+    return {
+        "pictures": [
+            {
+                "title": picture.title,
+                "caption": picture.caption,
+                "mime": picture.mime,
+                "data": base64.b64encode(picture.data).decode(),
+            }
+            for picture in drawn
+        ]
+    }
