@@ -368,9 +368,9 @@ def _computed(results: Results, seconds: Mapping[str, float]) -> str:
     columns = (Column("what", "what", TEXT), Column("seconds", "time", SECONDS))
     return (
         "<p>Meshes were grown by ROS 2 nodes: a mesher that keeps all simulators busy, an analysis "
-        "that solves the chain, and a recorder for each mesh. Limit cycles, walks and pictures were "
-        f"computed by one process for each core. Monte Carlo of Tables 2 and 4: {results.plan.walks} walks of each "
-        "controller.</p>"
+        "that solves the chain, and a recorder for each mesh. Limit cycles, walks and pictures "
+        "were computed by one process for each core. Monte Carlo of Tables 2 and 4: "
+        f"{results.plan.walks} walks of each controller.</p>"
         + _table(Table("times", "Times of this run, jobs side by side added up; what was there "
                        "already took none", columns, rows))
     )  # fmt: skip
