@@ -18,12 +18,14 @@ NODES = {"simulator", "mesher", "analysis", "recorder"}
 
 ROSDEP_KEYS = {
     "PIL": "python3-pil",
+    "cmaes": "cmaes",
     "hypothesis": "python3-hypothesis",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
     "mpmath": "python3-sympy",
     "numba": "python3-numba",
     "numpy": "python3-numpy",
+    "pymoo": "pymoo",
     "pytest": "python3-pytest",
     "rosbags": "python3-rosbags-pip",
     "scipy": "python3-scipy",

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.walker.robot import WalkerModel
+from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG, slope_set
 
 _MODEL_OPTIONS = (
@@ -24,8 +26,24 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def controller_of(args: argparse.Namespace) -> Controller:
-    """The controller that was asked for."""
-    return controller(args.controller)
+    """The controller that was asked for, of the catalogue or of a file."""
+    if args.controller_file is None:
+        return controller(args.controller)
+    made = controller_from_file(args.controller_file)
+    args.controller = made.name
+    return made
+
+
+def controller_from_file(path: str) -> Controller:
+    """Controller of a JSON object with name, scheme and parameters; raises InputError."""
+    try:
+        data = json.loads(Path(path).read_text())
+        made = Controller(str(data["name"]), data["scheme"], np.array(data["parameters"], float))
+        made.packed(rabbit())  # checks ranges
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = f"a JSON file with name, scheme and parameters ({error})"
+        raise InputError("--controller-file", path, reason) from None
+    return made
 
 
 def model_of(args: argparse.Namespace) -> WalkerModel:

@@ -1,0 +1,175 @@
+"""`biped-mfpt optimise`: search for better controllers."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from biped_mfpt_ros.cli import options
+from biped_mfpt_ros.cli.kernels import work
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.cli.study import best_trial, summary_text, trial_row
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.optimise.local import LocalBackend
+from biped_mfpt_ros.optimise.settings import DEFAULT_STAGES, Stage, StudySettings
+from biped_mfpt_ros.optimise.store import Store, Trial
+from biped_mfpt_ros.optimise.study import Study
+from biped_mfpt_ros.report.progress import Progress, duration_text, rate_text
+from biped_mfpt_ros.report.tables import number
+
+
+def optimise(args: argparse.Namespace) -> None:
+    """Run a study, or go on with one."""
+    settings = _settings(args)
+    name = args.study or "-".join(
+        [settings.start.name.replace("/", "-"), settings.searcher, f"{args.sigma:g}",
+         str(settings.seed)]
+    )  # fmt: skip
+    workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
+    for option, value, least in (("--workers", workers, 1), ("--trials", args.trials, 1)):
+        if value is not None and value < least:
+            raise InputError(option, value, f"a whole number >= {least}")
+    store = Store(Path(args.store))
+    study = Study(store, name, settings)
+    stop = threading.Event()
+    with work(args.quiet) as progress:
+        tally = _Tally(study, progress, workers, args.trials, args.seconds)
+        progress.say(
+            f"study {name} in {args.store}: {len(study.space)} free parameters, "
+            f"{len(tally.before)} trials so far"
+        )
+        try:
+            ended = study.run(LocalBackend(), workers, args.trials, args.seconds, tally.add, stop)
+        finally:
+            study.close()
+    trials = study.trials()
+    result = {
+        "study": name,
+        "store": args.store,
+        "settings": settings.as_json(),
+        "ended": ended,
+        "trials": sum(t.found is not None for t in trials),
+        **tally.throughput(),
+    }
+    best = best_trial(trials)
+    result["best"] = None if best is None else trial_row(study, best)
+    store.close()
+    if args.json:
+        print(json_text(result))
+        return
+    print(summary_text(study, trials))
+    print(
+        f"\n{tally.done} trials in {duration_text(tally.seconds)}, "
+        f"{rate_text(result['trials_per_second'])} a second; "
+        f"{100.0 * result['outside_step_map']:.0f} % of the time of {workers} workers was spent "
+        "outside of the step map"
+    )
+
+
+def _settings(args: argparse.Namespace) -> StudySettings:
+    stages = DEFAULT_STAGES
+    if args.mesh is not None:
+        stages = tuple(_stage(i, parts) for i, parts in enumerate(args.mesh))
+    if args.check_walks < 0:
+        raise InputError("--check-walks", args.check_walks, "a whole number >= 0")
+    given: dict[str, Any] = {} if args.check_walks else {"check_sigmas": ()}
+    return StudySettings(
+        start=options.controller_of(args),
+        searcher=args.searcher,
+        seed=args.seed,
+        step=args.step,
+        population=args.population,
+        fixed=tuple(args.fix),
+        objectives=dict(args.objective),
+        limits=dict(args.limit),
+        model=options.model_of(args),
+        mu_s=options.mean_of(args),
+        sigma_s=options.spread("--sigma", args.sigma),
+        slope_limit_deg=args.slope_limit,
+        stages=stages,
+        check_walks=args.check_walks or 1,
+        **given,
+    )
+
+
+def _stage(number: int, parts: tuple[float, ...]) -> Stage:
+    margin = math.inf if number == 0 else -0.02
+    more: dict[str, Any] = {"margin": parts[2] if len(parts) > 2 else margin}
+    if len(parts) > 3:
+        more["max_states"] = int(parts[3])
+    return Stage(parts[0], parts[1], **more)
+
+
+class _Tally:
+    """The live line: best so far, rate, time left, and what part of the time was overhead."""
+
+    def __init__(
+        self,
+        study: Study,
+        progress: Progress,
+        workers: int,
+        limit: int | None,
+        seconds: float | None,
+    ) -> None:
+        self.before = [t for t in study.trials() if t.found is not None]
+        self.done = 0
+        self._progress, self._workers = progress, workers
+        self._limit, self._most_seconds = limit, seconds
+        self._best = best_trial(self.before)
+        self._step_map_seconds = 0.0
+        self._start = time.monotonic()
+        self._study = study
+
+    @property
+    def seconds(self) -> float:
+        """Wall time, s."""
+        return time.monotonic() - self._start
+
+    def add(self, trial: Trial) -> None:
+        """Take a trial in and show the line."""
+        found = trial.found
+        assert found is not None
+        self.done += 1
+        self._step_map_seconds += found.step_map_seconds
+        best = self._best.found if self._best is not None else None
+        if found.confirmed and (best is None or found.score > best.score):
+            self._best = trial
+            self._progress.say(f"trial {trial.number}: {_found_text(trial)}")
+        throughput = self.throughput()
+        rate = throughput["trials_per_second"]
+        total = len(self.before) + self.done
+        parts = [f"{total} trials" if self._limit is None else f"{total} of {self._limit} trials"]
+        best_text = "nothing" if self._best is None else _found_text(self._best)
+        parts.append(f"best {best_text}")
+        parts.append(f"{rate_text(rate)} trials/s")
+        parts.append(f"{100.0 * throughput['outside_step_map']:.0f} % outside the step map")
+        left = []
+        if self._limit is not None and rate > 0.0:
+            left.append((self._limit - total) / rate)
+        if self._most_seconds is not None:
+            left.append(max(0.0, self._most_seconds - self.seconds))
+        if left:
+            parts.append(f"{duration_text(min(left))} left")
+        self._progress.show(", ".join(parts))
+
+    def throughput(self) -> dict[str, float]:
+        """Rate, and the share of the workers' time that was not spent in the step map."""
+        seconds = max(self.seconds, 1e-9)
+        return {
+            "seconds": seconds,
+            "trials_per_second": self.done / seconds,
+            "outside_step_map": 1.0 - self._step_map_seconds / (self._workers * seconds),
+        }
+
+
+def _found_text(trial: Trial) -> str:
+    assert trial.found is not None
+    values = trial.found.values
+    parts = [f"{label} {number(values[name])}" for name, label in (
+        ("mfpt", "MFPT"), ("cot", "COT"), ("speed", "speed")) if name in values]  # fmt: skip
+    return ", ".join(parts)

@@ -1,0 +1,243 @@
+"""`biped-mfpt study`: what studies have found."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from biped_mfpt_ros.cli.output import json_text
+from biped_mfpt_ros.control.controller import SCHEMES, Controller
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.optimise.store import Store, Trial
+from biped_mfpt_ros.optimise.study import Study
+from biped_mfpt_ros.report.tables import table
+
+
+def study(args: argparse.Namespace) -> None:
+    """List, show, plot or export studies."""
+    path = Path(args.store)
+    if not path.exists():
+        raise InputError("--store", args.store, "a file that `biped-mfpt optimise` wrote")
+    if args.output is not None and Path(args.output).exists():
+        raise InputError("--output", args.output, "a file that does not exist yet")
+    store = Store(path)
+    if args.what == "list":
+        _list(store, args)
+        return
+    if args.what == "front":
+        from biped_mfpt_ros.report import studies
+
+        opened = [Study(store, name) for name in _names(args, 1, 100)]
+        _save(studies.front(opened), args)
+        return
+    (name,) = _names(args, 1, 1)
+    opened_study = Study(store, name)
+    if args.what == "show":
+        _show(opened_study, args)
+    elif args.what == "export":
+        _export(opened_study, args)
+    else:
+        from biped_mfpt_ros.report import studies
+
+        _save(studies.history(opened_study), args)
+
+
+def _names(args: argparse.Namespace, least: int, most: int) -> list[str]:
+    if not least <= len(args.study) <= most:
+        wanted = "one name of a study" if most == 1 else "names of studies"
+        raise InputError("STUDY", args.study, wanted)
+    return list(args.study)
+
+
+def _save(picture: Any, args: argparse.Namespace) -> None:
+    if args.output is None:
+        raise InputError("--output", None, f"a new file, for {args.what}")
+    picture.save(args.output)
+    if args.json:
+        print(json_text({"output": args.output, "caption": picture.caption}))
+    else:
+        print(f"{picture.caption}\nwritten to {args.output}")
+
+
+def best_trial(trials: list[Trial]) -> Trial | None:
+    """The confirmed trial with the best score, the first of equals; None if there is none."""
+    confirmed = [t for t in trials if t.found is not None and t.found.confirmed]
+    return max(confirmed, key=lambda t: (t.found.score, -t.number), default=None)  # type: ignore[union-attr]
+
+
+def trial_row(study: Study, trial: Trial) -> dict[str, Any]:
+    """A trial for JSON."""
+    row: dict[str, Any] = {
+        "number": trial.number,
+        "generation": trial.generation,
+        "status": trial.status,
+        "vector": trial.vector,
+    }
+    try:
+        row["controller"] = described(study.controller(trial))
+    except InputError as error:
+        row["controller"] = None
+        row["problem"] = str(error)
+    if trial.found is not None:
+        row |= vars(trial.found) | {"finished": trial.finished, "step_map": trial.step_map}
+    return row
+
+
+def described(controller: Controller) -> dict[str, Any]:
+    """A controller for JSON: as --controller-file takes it, by name, and as in the catalogue."""
+    names = SCHEMES[controller.scheme].parameters
+    named = dict(zip(names, controller.parameters.tolist(), strict=False))
+    return {
+        "name": controller.name,
+        "scheme": controller.scheme,
+        "parameters": controller.parameters.tolist(),
+        "named": named,
+        "catalogue": _catalogue_row(controller, named),
+    }
+
+
+def _catalogue_row(controller: Controller, named: dict[str, float]) -> dict[str, Any]:
+    """As a row of data/controllers.json."""
+    if controller.scheme == "hzd":
+        bezier = controller.parameters[2:30].reshape(4, 7)
+        return {"kp": named["kp"], "kd": named["kd"], "bezier": bezier.tolist()}
+    if controller.scheme == "smc":
+        return {
+            f"{name}_deg" if "_ref" in name else name: float(np.degrees(value))
+            if "_ref" in name
+            else value
+            for name, value in named.items()
+        }
+    return named
+
+
+def _list(store: Store, args: argparse.Namespace) -> None:
+    rows = []
+    for name in store.names():
+        opened = Study(store, name)
+        trials = opened.trials()
+        best = best_trial(trials)
+        rows.append(
+            {
+                "study": name,
+                "start": opened.settings.start.name,
+                "searcher": opened.settings.searcher,
+                "objectives": opened.settings.objectives,
+                "sigma_s": opened.settings.sigma_s,
+                "trials": sum(t.found is not None for t in trials),
+                "confirmed": sum(t.found is not None and t.found.confirmed for t in trials),
+                "best": None if best is None or best.found is None else best.found.values,
+            }
+        )
+    if args.json:
+        print(json_text({"store": args.store, "studies": rows}))
+        return
+    headers = ("study", "start", "searcher", "sigma", "trials", "confirmed", "best MFPT", "COT")
+    print(
+        table(
+            headers,
+            [
+                (
+                    row["study"],
+                    row["start"],
+                    row["searcher"],
+                    f"{np.degrees(row['sigma_s']):g} deg",
+                    row["trials"],
+                    row["confirmed"],
+                    (row["best"] or {}).get("mfpt"),
+                    (row["best"] or {}).get("cot"),
+                )
+                for row in rows
+            ],
+        )
+    )
+
+
+def _show(opened: Study, args: argparse.Namespace) -> None:
+    trials = opened.trials()
+    if args.json:
+        print(
+            json_text(
+                {
+                    "study": opened.name,
+                    "settings": opened.settings.as_json(),
+                    "space": opened.space.described(),
+                    "trials": [trial_row(opened, t) for t in trials],
+                }
+            )
+        )
+        return
+    print(summary_text(opened, trials, args.top))
+    best = best_trial(trials)
+    if best is not None:
+        named = described(opened.controller(best))["named"]
+        print(f"\nparameters of trial {best.number}:")
+        print(table(("name", "start", "best", "steps away"), [
+            (row["name"], row["start"], named[str(row["name"])], float(distance))
+            for row, distance in zip(opened.space.described(), best.vector, strict=True)
+        ]))  # fmt: skip
+
+
+def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
+    """How far trials came, and the best of them, for readers."""
+    done = [t for t in trials if t.found is not None]
+    stages: dict[str, int] = {}
+    for t in done:
+        assert t.found is not None
+        stages[t.found.stage] = stages.get(t.found.stage, 0) + 1
+    counts = ", ".join(f"{count} {stage}" for stage, count in sorted(stages.items()))
+    lines = [f"study {study.name}: {len(done)} trials ({counts})"]
+    confirmed = sorted(
+        (t for t in done if t.found is not None and t.found.confirmed),
+        key=lambda t: (-t.found.score, t.number),  # type: ignore[union-attr]
+    )
+    if not confirmed:
+        return "\n".join([*lines, "nothing is confirmed yet"])
+    sigma = np.degrees(study.settings.sigma_s)
+    rows = []
+    for t in confirmed[:top]:
+        assert t.found is not None
+        v = t.found.values
+        check = ""
+        if "check_steps" in v:
+            check = (
+                f"{v['check_steps']:.4g} (mesh {v['check_claimed']:.4g}) "
+                f"at {np.degrees(v['check_sigma']):g} deg"
+            )
+        rows.append((t.number, t.found.score, v.get("mfpt"), t.found.states, v["cot"], v["speed"],
+                     check))  # fmt: skip
+    headers = ("trial", "score", f"MFPT at {sigma:g} deg", "states", "COT", "m/s", "Monte Carlo")
+    return "\n".join([*lines, "", "confirmed:", table(headers, rows)])
+
+
+def _export(opened: Study, args: argparse.Namespace) -> None:
+    trials = opened.trials()
+    if args.trial is None:
+        trial = best_trial(trials)
+        if trial is None:
+            raise InputError("STUDY", opened.name, "one with a confirmed trial, or --trial")
+    else:
+        found = [t for t in trials if t.number == args.trial and t.found is not None]
+        if not found:
+            raise InputError("--trial", args.trial, f"a finished one of {len(trials)} trials")
+        trial = found[0]
+    assert trial.found is not None
+    text = json_text(
+        described(opened.controller(trial))
+        | {
+            "study": opened.name,
+            "trial": trial.number,
+            "found": vars(trial.found),
+            "settings": opened.settings.as_json(),
+            "step_map": trial.step_map,
+        }
+    )
+    if args.output is None:
+        print(text)
+        return
+    with open(args.output, "x") as file:
+        file.write(text + "\n")
+    print(f"written to {args.output}")

@@ -1,0 +1,261 @@
+"""Running a study: generation by generation, its trials side by side, from a store.
+
+A searcher is a function of what it was told, and the store keeps all of that: a study that was
+stopped, however, is taken up by telling a new searcher what is in the store. Several processes,
+each with a searcher of its own, may work on the same study. The trials are the same, whoever and
+how many they are: they depend on the settings alone.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+from biped_mfpt_ros.control.controller import Controller
+from biped_mfpt_ros.jit import STEP_MAP
+from biped_mfpt_ros.optimise.scoring import (
+    Backend,
+    Best,
+    Evaluation,
+    Stopped,
+    evaluate,
+    front_of,
+)
+from biped_mfpt_ros.optimise.searchers import Told, make_searcher
+from biped_mfpt_ros.optimise.settings import StudySettings
+from biped_mfpt_ros.optimise.space import SearchSpace
+from biped_mfpt_ros.optimise.store import Store, Trial, this_owner
+
+_BEAT = 5.0  # s, between two signs of life
+_LOOK = 0.2  # s, between two looks for what other processes have finished
+
+
+class Study:
+    """A study of a store, and a searcher that has been told what is known.
+
+    Parameters
+    ----------
+    store : Store
+        Where it is kept.
+    name : str
+        Of the study.
+    settings : StudySettings, optional
+        Of a new study, or equal to those it has; those that it has by default.
+    owner : str, optional
+        Under which name trials are claimed; that of this process by default.
+
+    Attributes
+    ----------
+    settings : StudySettings
+        Its settings.
+    space : SearchSpace
+        Its space.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        name: str,
+        settings: StudySettings | None = None,
+        owner: str | None = None,
+    ) -> None:
+        self.store, self.name = store, name
+        if settings is None:
+            self._id, self.settings = store.open(name)
+            self.space = SearchSpace(
+                self.settings.start, self.settings.model.robot, self.settings.fixed
+            )
+        else:
+            # What is wrong with the settings is found before anything is written.
+            self.settings = settings
+            self.space = SearchSpace(settings.start, settings.model.robot, settings.fixed)
+            self._id = store.create(name, settings)
+        self.owner = owner or this_owner()
+        self._searcher = make_searcher(
+            self.settings.searcher,
+            self.space.bounds,
+            seed=self.settings.seed,
+            step=self.settings.step,
+            population=self.settings.population,
+            objectives=len(self.settings.objectives),
+        )
+        self._lock = threading.Condition()
+        self._told = 0  # generations
+        self._first = 0  # number of the first trial of the generation that is open
+        self._best = Best()
+
+    def controller(self, trial: Trial) -> Controller:
+        """What a trial tries; InputError if there is no such controller."""
+        return self.space.controller(trial.vector, f"{self.settings.start.scheme}/{self.name}-"
+                                     f"{trial.number}")  # fmt: skip
+
+    def trials(self) -> list[Trial]:
+        """All trials by now, in order."""
+        return self.store.trials(self._id)
+
+    def run(
+        self,
+        backend: Backend,
+        workers: int = 1,
+        trials: int | None = None,
+        seconds: float | None = None,
+        on_trial: Callable[[Trial], None] | None = None,
+        stop: threading.Event | None = None,
+    ) -> str:
+        """Work on the study.
+
+        Parameters
+        ----------
+        backend : Backend
+            Who grows meshes.
+        workers : int, optional
+            Trials at the same time, each in a thread.
+        trials : int, optional
+            Until the study has so many.
+        seconds : float, optional
+            s, after which no further trial is begun.
+        on_trial : callable, optional
+            Told of each trial that was finished here, one at a time.
+        stop : threading.Event, optional
+            Set to stop at once; trials in flight are given back.
+
+        Returns
+        -------
+        str
+            Why it ended: ``trials``, ``seconds``, ``converged`` or ``stopped``.
+
+        Raises
+        ------
+        Exception
+            Whatever a backend raises that does not lie in a candidate; the trial is given back.
+        """
+        stop = stop or threading.Event()
+        ended = threading.Event()
+        deadline = math.inf if seconds is None else time.monotonic() + seconds
+        limit = 2**62 if trials is None else trials
+        errors: list[BaseException] = []
+        reasons: list[str] = []
+
+        def work() -> None:
+            try:
+                while not stop.is_set():
+                    if time.monotonic() > deadline:
+                        reasons.append("seconds")
+                        return
+                    trial = self._next(limit)
+                    if isinstance(trial, str):
+                        reasons.append(trial)
+                        return
+                    if trial is None:
+                        with self._lock:
+                            self._lock.wait(_LOOK)
+                        continue
+                    self._try(trial, backend, stop, on_trial)
+            except Stopped:
+                pass
+            except BaseException as error:
+                errors.append(error)
+                stop.set()
+
+        def beat() -> None:
+            while not ended.wait(_BEAT):
+                self.store.beat(self.owner)
+
+        beating = threading.Thread(target=beat, daemon=True)
+        beating.start()
+        try:
+            with ThreadPoolExecutor(workers, "trial") as pool:
+                try:
+                    for job in [pool.submit(work) for _ in range(workers)]:
+                        job.result()
+                except BaseException:
+                    stop.set()
+                    raise
+        finally:
+            ended.set()
+            beating.join()
+            self.store.release(self._id, self.owner)
+        if errors:
+            raise errors[0]
+        return "stopped" if stop.is_set() or not reasons else reasons[0]
+
+    def close(self) -> None:
+        """End the searcher."""
+        self._searcher.close()
+
+    def _next(self, limit: int) -> Trial | str | None:
+        """A trial, why there is none any more, or None: wait for others."""
+        with self._lock:
+            while True:
+                trial = self.store.claim(self._id, self.owner, limit)
+                if trial is not None:
+                    # It belongs to a generation that another process may have opened.
+                    self._catch_up()
+                    return trial
+                self._catch_up()
+                proposed, done = self.store.counts(self._id)
+                if proposed >= limit:
+                    if self._done_below(limit):
+                        return "trials"
+                    return None
+                if proposed > done:
+                    return None
+                if self._searcher.done:
+                    return "converged"
+                self.store.propose(self._id, self._told, self._first, self._searcher.ask())
+
+    def _done_below(self, limit: int) -> bool:
+        return all(
+            trial.status == "done"
+            for trial in self.store.trials(self._id, self._told)
+            if trial.number < limit
+        )
+
+    def _catch_up(self) -> None:
+        """Tell the searcher every generation that is complete."""
+        while True:
+            generation = self.store.trials(self._id, self._told)
+            if not generation or any(trial.found is None for trial in generation):
+                return
+            vectors = self._searcher.ask()
+            if [t.vector.tobytes() for t in generation] != [v.tobytes() for v in vectors]:
+                raise RuntimeError(
+                    f"generation {self._told} of study {self.name} was proposed by another "
+                    "version of the searcher; begin a new study"
+                )
+            found = [trial.found for trial in generation if trial.found is not None]
+            self._searcher.tell(vectors, [Told(e.score, e.costs, e.violation) for e in found])
+            self._best = improved(self._best, found)
+            self._told += 1
+            self._first += len(generation)
+            self._lock.notify_all()
+
+    def _try(
+        self,
+        trial: Trial,
+        backend: Backend,
+        stop: threading.Event,
+        on_trial: Callable[[Trial], None] | None,
+    ) -> None:
+        """Score a trial and keep what comes out."""
+        with self._lock:
+            best = self._best
+        found = evaluate(lambda: self.controller(trial), self.settings, best, backend, stop.is_set)
+        kept = self.store.finish(self._id, trial.number, self.owner, found, STEP_MAP)
+        with self._lock:
+            self._lock.notify_all()
+            if kept and on_trial is not None:
+                on_trial(replace(trial, status="done", found=found, finished=time.time(),
+                                 step_map=STEP_MAP))  # fmt: skip
+
+
+def improved(best: Best, found: list[Evaluation]) -> Best:
+    """The best confirmed scores, those of another generation taken in."""
+    confirmed = [e for e in found if e.confirmed]
+    score = max([best.score, *(e.score for e in confirmed)])
+    costs = [*best.front, *(e.costs for e in confirmed)]
+    return Best(score, tuple(costs[i] for i in front_of(costs)))

@@ -1,0 +1,334 @@
+"""Search spaces, searchers, the store and studies; scoring is in test_scoring.py."""
+
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from biped_mfpt_ros.control import hzd
+from biped_mfpt_ros.control.controller import catalogue, controller
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.optimise import store as store_module
+from biped_mfpt_ros.optimise import study as study_module
+from biped_mfpt_ros.optimise.scoring import Evaluation, Stopped
+from biped_mfpt_ros.optimise.searchers import SEARCHERS, Told, make_searcher
+from biped_mfpt_ros.optimise.settings import Stage, StudySettings
+from biped_mfpt_ros.optimise.space import SearchSpace
+from biped_mfpt_ros.optimise.store import Store
+from biped_mfpt_ros.optimise.study import Study
+from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
+
+# Spaces ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", catalogue())
+def test_zero_is_the_start(name):
+    start = controller(name)
+    space = SearchSpace(start, rabbit())
+    found = space.controller(np.zeros(len(space)))
+    # The paper's alpha_0 and alpha_1 are rounded to four digits; here they are computed.
+    tolerance = 1.1e-4 if name.startswith("hzd") else 1e-15
+    np.testing.assert_allclose(found.parameters, start.parameters, rtol=0, atol=tolerance * 50)
+    assert len(space) == {"hzd": 22, "smc": 18}[start.scheme]
+    assert (space.bounds[:, 0] <= 0.0).all()
+    assert (space.bounds[:, 1] >= 0.0).all()
+
+
+def test_every_hzd_candidate_is_hybrid_invariant():
+    space = SearchSpace(controller("hzd/base"), rabbit())
+    vector = np.random.default_rng(1).normal(size=22)
+    made = space.controller(vector)
+    bezier = made.parameters[2:30].reshape(4, 7)
+    # The references right after the impact are where the impact leaves the joints: q and dq.
+    state = made.reference_state(1.5, rabbit())
+    np.testing.assert_allclose(bezier[:, 0], state[:4], atol=1e-12)
+    start, end = hzd.phase_range(bezier, rabbit())
+    slope = 6.0 * (bezier[:, 1] - bezier[:, 0]) / (end - start)
+    np.testing.assert_allclose(slope * hzd.phase(state[5:]), state[5:9], atol=1e-11)
+
+
+def test_fixed_coordinates_stay():
+    start = controller("hzd/mfpt")
+    space = SearchSpace(start, rabbit(), ["k?", "alpha_*^3"])
+    assert len(space) == 15
+    assert not {c.name for c in space.coordinates} & {"kp", "kd", "alpha_4^3"}
+    made = space.controller(np.ones(15))
+    names = hzd.PARAMETERS
+    for name in ("kp", "kd", "alpha_2^3", "alpha_6^3"):
+        i = names.index(name)
+        assert made.parameters[i] == pytest.approx(start.parameters[i], rel=1e-14)
+    i = names.index("alpha_4^1")
+    assert made.parameters[i] == pytest.approx(start.parameters[i] + 0.02)
+    with pytest.raises(InputError, match="fixed: 'omega'"):
+        SearchSpace(start, rabbit(), ["omega"])
+    with pytest.raises(InputError, match="leave something free"):
+        SearchSpace(start, rabbit(), ["*"])
+
+
+def test_what_is_no_gait_is_an_input_error():
+    space = SearchSpace(controller("hzd/mfpt"), rabbit())
+    with pytest.raises(InputError):
+        space.controller(np.full(22, math.nan))
+
+
+# Searchers ---------------------------------------------------------------------------------------
+
+TARGET = np.array([1.3, -0.7, 0.4, 2.0])
+
+
+def quadratic(x):
+    return float((np.array([1.0, 3.0, 10.0, 0.3]) * (x - TARGET) ** 2).sum())
+
+
+def told(x):
+    if x.size == 4 and x[3] > 4.5:  # a constraint, away from the optimum
+        return Told(-1e3 - x[3], (math.nan, math.nan), x[3] - 4.5)
+    return Told(-quadratic(x), (quadratic(x), float(np.abs(x).sum())), 0.0)
+
+
+def searched(name, most, seed=3, objectives=2):
+    searcher = make_searcher(name, np.array([[-5.0, 5.0]] * 4), seed=seed, objectives=objectives)
+    asked = []
+    while sum(map(len, asked)) < most and not searcher.done:
+        vectors = searcher.ask()
+        assert vectors.shape[1] == 4
+        assert (np.abs(vectors) <= 5.0).all()
+        np.testing.assert_array_equal(vectors, searcher.ask())
+        asked.append(vectors)
+        searcher.tell(vectors, [told(x) for x in vectors])
+    searcher.close()
+    return np.concatenate(asked), searcher.done
+
+
+@pytest.mark.parametrize("name", SEARCHERS)
+def test_searcher_starts_at_the_start_and_is_reproducible(name):
+    first, _ = searched(name, 150)
+    again, _ = searched(name, 150)
+    assert not first[0].any()
+    assert first.tobytes() == again.tobytes()
+    if name in ("cma-es", "nsga2"):
+        other, _ = searched(name, 150, seed=4)
+        assert first.tobytes() != other.tobytes()
+
+
+@pytest.mark.parametrize(("name", "within"), [("cma-es", 1e-6), ("nelder-mead", 1e-5),
+                                              ("pattern", 1e-5)])  # fmt: skip
+def test_searcher_finds_the_optimum(name, within):
+    found, _ = searched(name, 2000)
+    assert min(map(quadratic, found)) < within
+
+
+def test_nsga2_spreads_over_the_front():
+    found, _ = searched("nsga2", 2000)
+    ends = min(map(quadratic, found)), min(np.abs(x).sum() for x in found)
+    assert ends[0] < 0.05  # one end: the optimum of the first objective
+    assert ends[1] == 0.0  # the other: the start is that of the second
+
+
+def test_nelder_mead_is_that_of_scipy():
+    asked, done = searched("nelder-mead", 10_000)
+    assert done
+    simplex = np.concatenate([np.zeros((1, 4)), np.eye(4)])
+    result = minimize(
+        quadratic, simplex[0], method="Nelder-Mead", bounds=[(-5, 5)] * 4,
+        options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-6},
+    )  # fmt: skip
+    assert len(asked) == result.nfev
+    np.testing.assert_array_equal(min(asked, key=quadratic), result.x)
+
+
+def test_unknown_searcher_is_an_input_error():
+    with pytest.raises(InputError, match="one of cma-es"):
+        make_searcher("luck", np.array([[-1.0, 1.0]]))
+
+
+# Studies -----------------------------------------------------------------------------------------
+
+
+class Scored:
+    """Stands for `evaluate`: a quadratic of the vector, and what was scored by whom."""
+
+    def __init__(self, seconds=0.0):
+        self.seconds = seconds
+        self.calls = []
+        self.at_most = None
+
+    def __call__(self, make, settings, best, backend, stopping):
+        if self.at_most is not None and len(self.calls) >= self.at_most:
+            raise Stopped
+        self.calls.append(threading.get_ident())
+        parameters = make().parameters
+        time.sleep(self.seconds)
+        score = -float(np.square(parameters - 0.5 * settings.start.parameters).sum())
+        # What is confirmed depends on the best before: so must be equal however it is run.
+        stage = "confirmed" if score > best.score else "mesh 1"
+        return Evaluation(stage, score, (-score,), 0.0, {"mfpt": score})
+
+
+SETTINGS = StudySettings(controller("smc/base"), seed=5)
+
+
+@pytest.fixture
+def scored(monkeypatch):
+    found = Scored()
+    monkeypatch.setattr(study_module, "evaluate", found)
+    return found
+
+
+def run(path, trials=40, workers=1, owner=None, settings=SETTINGS, **more):
+    store = Store(path)
+    study = Study(store, "test", settings, owner)
+    try:
+        return study.run(None, workers, trials, **more), outline(study)
+    finally:
+        study.close()
+        store.close()
+
+
+def outline(study):
+    return [
+        (t.number, t.generation, t.vector.tobytes(), t.found and (t.found.score, t.found.stage))
+        for t in study.trials()
+    ]
+
+
+@pytest.mark.parametrize("searcher", ["cma-es", "nelder-mead", "pattern"])
+def test_trials_do_not_depend_on_the_number_of_workers(scored, tmp_path, searcher):
+    settings = StudySettings(controller("smc/base"), searcher, seed=5)
+    reason, one = run(tmp_path / "1.sqlite", settings=settings)
+    scored.seconds = 1e-3
+    _, four = run(tmp_path / "4.sqlite", workers=4, settings=settings)
+    assert reason == "trials"
+    assert sum(t[3] is not None for t in one) == 40
+    assert one == four
+    assert len(scored.calls) == 80
+
+
+def test_a_study_that_was_stopped_goes_on_as_if_it_had_not_been(scored, tmp_path):
+    _, undisturbed = run(tmp_path / "whole.sqlite")
+    scored.calls.clear()
+    for most in (1, 7, 20):
+        scored.at_most = most
+        run(tmp_path / "parts.sqlite", workers=2)
+    scored.at_most = None
+    _, parts = run(tmp_path / "parts.sqlite", workers=2)
+    assert parts == undisturbed
+    assert len(scored.calls) == 40  # none was scored twice
+    # More trials of the same study: those of a longer one from the start.
+    assert run(tmp_path / "parts.sqlite", 60)[1] == run(tmp_path / "long.sqlite", 60)[1]
+
+
+def test_two_owners_share_a_study_and_score_nothing_twice(scored, tmp_path):
+    _, undisturbed = run(tmp_path / "whole.sqlite", 60)
+    scored.calls.clear()
+    scored.seconds = 0.02
+    shared = tmp_path / "shared.sqlite"
+    threads = [
+        threading.Thread(target=run, args=(shared, 60, 2, f"elsewhere:{i}:0")) for i in (1, 2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(scored.calls) == 60
+    _, trials = run(shared, 60)
+    assert trials == undisturbed
+    store = Store(shared)
+    owners = {t.owner for t in Study(store, "test").trials() if t.found is not None}
+    assert owners == {"elsewhere:1:0", "elsewhere:2:0"}
+    store.close()
+
+
+@pytest.mark.parametrize("owner", ["elsewhere:1:0", None])
+def test_claims_of_a_dead_owner_are_taken_over(scored, tmp_path, monkeypatch, owner):
+    path = tmp_path / "s.sqlite"
+    store = Store(path)
+    study = Study(store, "test", SETTINGS)
+    store.propose(study._id, 0, 0, np.zeros((1, 18)))
+    # On this host a process that is gone is known to be; of another one only silence tells.
+    dead = owner or store_module.this_owner().rpartition(":")[0] + ":0"
+    assert store.claim(study._id, dead, 10).number == 0
+    if owner is not None:
+        assert store.claim(study._id, "me:1:0", 10) is None
+        monkeypatch.setattr(store_module, "STALE_SECONDS", -1.0)
+    assert store.claim(study._id, "me:1:0", 10).number == 0
+    found = Evaluation("falls", -1.0)
+    assert not store.finish(study._id, 0, dead, found, "")  # it has lost it
+    assert store.finish(study._id, 0, "me:1:0", found, "")
+    assert store.trials(study._id)[0].found == found
+    store.close()
+
+
+def test_an_error_of_the_backend_gives_the_trial_back(tmp_path, monkeypatch):
+    def fails(*args):
+        raise OSError("no network")
+
+    monkeypatch.setattr(study_module, "evaluate", fails)
+    with pytest.raises(OSError, match="no network"):
+        run(tmp_path / "s.sqlite", workers=2)
+    store = Store(tmp_path / "s.sqlite")
+    assert [t.status for t in Study(store, "test").trials()] == ["pending"]
+    store.close()
+
+
+def test_stop_and_deadline_end_a_study(scored, tmp_path):
+    scored.seconds = 0.01
+    stop = threading.Event()
+    begun = time.monotonic()
+    reason, _ = run(
+        tmp_path / "s.sqlite", trials=None, stop=stop,
+        on_trial=lambda t: t.number == 5 and stop.set(),
+    )  # fmt: skip
+    assert reason == "stopped"
+    assert len(scored.calls) == 6
+    reason, _ = run(tmp_path / "s.sqlite", trials=None, seconds=0.2)
+    assert reason == "seconds"
+    assert time.monotonic() - begun < 20.0
+
+
+def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
+    settings = StudySettings(
+        controller("hzd/mfpt"), "nsga2", fixed=("k?",), objectives={"mfpt": 1.0, "cot": 20.0},
+        limits={"speed_min": 0.5}, model=WalkerModel(torque_limit=math.inf),
+        stages=(Stage(1.0, 1.0), Stage(0.5, 0.3, -0.1, 500)), check_sigmas=(),
+    )  # fmt: skip
+    again = StudySettings.from_json(settings.as_json())
+    assert again.as_json() == settings.as_json()
+    assert again.model == settings.model
+    assert again.stages == settings.stages
+    run(tmp_path / "s.sqlite", 1)
+    with pytest.raises(InputError, match="seed \\(was 5\\)"):
+        run(tmp_path / "s.sqlite", 1, settings=StudySettings(controller("smc/base"), seed=6))
+    store = Store(tmp_path / "s.sqlite")
+    with pytest.raises(InputError, match=r"one of those in .*: test"):
+        Study(store, "other")
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("field", "change"),
+    [
+        ("searcher", {"searcher": "luck"}),
+        ("searcher", {"searcher": "nsga2"}),
+        ("objectives", {"objectives": {"beauty": 1.0}}),
+        ("objectives[mfpt]", {"objectives": {"mfpt": -1.0}}),
+        ("limits", {"limits": {"weight_max": 1.0}}),
+        ("sigma_s", {"sigma_s": math.nan}),
+        ("threshold", {"stages": (Stage(0.5, 0.0),)}),
+        ("slope_step_deg", {"stages": (Stage(0.3, 0.1),)}),
+        ("step", {"step": 0.0}),
+    ],
+)
+def test_bad_settings_are_refused(field, change):
+    with pytest.raises(InputError) as error:
+        StudySettings(controller("hzd/mfpt"), **change)
+    assert error.value.field == field
+
+
+def test_a_file_that_is_no_store_is_refused(tmp_path):
+    (tmp_path / "text").write_text("no database, but long enough to be read as one" * 100)
+    with pytest.raises(InputError, match="store"):
+        Store(tmp_path / "text")
