@@ -32,7 +32,7 @@ def test_zero_is_the_start(name):
     # The paper's alpha_0 and alpha_1 are rounded to four digits; here they are computed.
     tolerance = 1.1e-4 if name.startswith("hzd") else 1e-15
     np.testing.assert_allclose(found.parameters, start.parameters, rtol=0, atol=tolerance * 50)
-    assert len(space) == {"hzd": 22, "smc": 18}[start.scheme]
+    assert len(space) == {"hzd": 22, "smc": 18, "spline": 42}[start.scheme]
     assert (space.bounds[:, 0] <= 0.0).all()
     assert (space.bounds[:, 1] >= 0.0).all()
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from biped_mfpt_ros.control import hzd, smc
+from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.walker.robot import Robot
@@ -104,10 +104,27 @@ def _smc_coordinate(name: str) -> Coordinate:
     return Coordinate(name, 0.02, low, high)
 
 
+def _spline_coordinate(name: str) -> Coordinate:
+    if name.startswith("kp"):
+        return Coordinate(name, 0.2, 10.0, 1e4, log=True)
+    if name.startswith("kd"):
+        return Coordinate(name, 0.2, 1.0, 500.0, log=True)
+    if name.startswith("theta"):
+        return Coordinate(name, 0.03, -4.5, -1.5)
+    # rad, of theta_2, q3, q4 and q5
+    low, high = {"1": (2.2, 5.0), "2": (-1.8, 0.5), "3": (-2.2, 0.8), "4": (-1.0, 1.0)}[name[-1]]
+    return Coordinate(name, 0.03, low, high)
+
+
 PARAMETRISATIONS = {
     "hzd": Parametrisation(_hzd_coordinates(), _hzd_free, _hzd_parameters),
     "smc": Parametrisation(
         tuple(_smc_coordinate(name) for name in smc.PARAMETERS),
+        lambda parameters: np.array(parameters),
+        lambda free, start, robot: free,
+    ),
+    "spline": Parametrisation(
+        tuple(_spline_coordinate(name) for name in spline.PARAMETERS),
         lambda parameters: np.array(parameters),
         lambda free, start, robot: free,
     ),
