@@ -35,11 +35,14 @@ def _digest(patterns: tuple[str, ...]) -> str:
 STEP_MAP: str = f"{__version__}+{_digest(_STEP_SOURCES)}"
 """Version and digest of the code and data that simulate a step."""
 
+KERNELS: str = _digest(_KERNEL_SOURCES)
+"""Digest of the code and data that decide a mesh, given the answers, and those too."""
+
 CACHE_DIR = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "biped_mfpt_ros"
 """Where compiled kernels are kept, in one directory for each state of the kernel sources."""
 
 if not os.environ.get("NUMBA_CACHE_DIR"):
-    numba.config.CACHE_DIR = str(CACHE_DIR / f"{numba.__version__}-{_digest(_KERNEL_SOURCES)}")
+    numba.config.CACHE_DIR = str(CACHE_DIR / f"{numba.__version__}-{KERNELS}")
 
 kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 """Decorator of every numeric kernel: compiled once, cached on disk, run without the GIL."""

@@ -176,6 +176,18 @@ class Client(Node):
         callback = None if feedback is None else lambda m: feedback(m.feedback.progress)
         return result_of(self._grow.send_goal_async(goal, feedback_callback=callback))
 
+    def send_goal_to(self, node, settings):
+        """Handle of a goal for a mesher by the name of its node.
+
+        One that was killed before is on the graph for some time, so that being ready means little.
+        """
+        wait_for(lambda: node in self.get_node_names(), node, STARTING)
+        goal = GrowMesh.Goal(settings=settings_message(settings))
+        for _ in range(10):
+            with suppress(AssertionError):
+                return result_of(self._grow.send_goal_async(goal), 3.0)
+        raise AssertionError(f"{node} answers no goal")
+
     def grow(self, settings, feedback=None):
         """Status and result of a goal."""
         handle = self.send_goal(settings, feedback)

@@ -114,7 +114,11 @@ class Swings:
     def __init__(self, states, previous):
         self.given = states, previous
         self.known = len(states) + 1
+        self.resumed = 0
         self.answers = {}
+
+    def unanswered(self, start, most):
+        return start, min(start + most, self.known)
 
     def states(self, start, stop):
         return tuple(array[start - 1 : stop - 1] for array in self.given)

@@ -54,6 +54,8 @@ SCALE_REFRESHES = ("generation", "addition")
 # good to 1e-6 or so: nothing that is still to be told apart lies below.
 _ROUNDING = 1e-12
 
+_CHECKED_ROWS = 4096
+
 
 class MeshLimitError(RuntimeError):
     """A mesh would hold more states than allowed.
@@ -97,6 +99,44 @@ class Steps(Protocol):
         """States after the k steps with outcome STEP, in row-major order of them, (k, 10)."""
 
 
+class Answers(Protocol):
+    """Where a growth keeps its answers until the targets are known.
+
+    An answer is that of the n states from an index on: outcomes, uint8, shape (n, m), and the k
+    successors, shape (k, 10).
+    """
+
+    def __contains__(self, start: object) -> bool: ...
+
+    def __iter__(self) -> Iterator[int]:
+        """The first states of all answers."""
+
+    def rows(self, start: int) -> int:
+        """Number of states of the answer that begins with state ``start``."""
+
+    def put(self, start: int, outcomes: np.ndarray, successors: np.ndarray) -> None:
+        """Keep an answer."""
+
+    def get(self, start: int) -> tuple[np.ndarray, np.ndarray]:
+        """The answer that begins with state ``start``."""
+
+
+class AnswersInMemory(dict[int, tuple[np.ndarray, np.ndarray]]):
+    """`Answers` of a small mesh: 6.5 kB a state where there are 81 slopes."""
+
+    def rows(self, start: int) -> int:
+        """Number of states of an answer."""
+        return len(self[start][0])
+
+    def put(self, start: int, outcomes: np.ndarray, successors: np.ndarray) -> None:
+        """Keep an answer."""
+        self[start] = outcomes, successors
+
+    def get(self, start: int) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[override]
+        """An answer."""
+        return self[start]
+
+
 Simulate = Callable[[np.ndarray, np.ndarray], Steps]
 OnGeneration = Callable[[int, int, np.ndarray, np.ndarray], object]
 
@@ -119,6 +159,8 @@ def checked_array(
         raise InputError(field, value, f"an array of numbers of shape {shape}") from None
     if given.shape != shape:
         raise InputError(field, given.shape, f"an array of shape {shape}")
+    if given.dtype == out.dtype:
+        return out
     # NaN is left to the caller: it survives a cast to float, and no other.
     changed = (out != given) & ~(np.isnan(out) & np.isnan(given))
     if changed.any():
@@ -244,14 +286,18 @@ def check_transitions(targets: np.ndarray, outcomes: np.ndarray) -> None:
             (targets[0].tolist(), outcomes[0].tolist()),
             f"all 0 and all {NOT_SIMULATED}: the failure state takes no step",
         )
-    wrong = (targets[1:] == 0) == (outcomes[1:] == Outcome.STEP)
-    if wrong.any():
-        i, s = np.argwhere(wrong)[0]
-        raise InputError(
-            f"targets[{i + 1}, {s}], outcomes[{i + 1}, {s}]",
-            (int(targets[i + 1, s]), int(outcomes[i + 1, s])),
-            "target 0 for a fall, outcome 0 (STEP) with any other target",
-        )
+    # By blocks: the truth values of a large mesh would take as much as the mesh.
+    for first in range(1, n, _CHECKED_ROWS):
+        block = slice(first, first + _CHECKED_ROWS)
+        wrong = (targets[block] == 0) == (outcomes[block] == Outcome.STEP)
+        if wrong.any():
+            i, s = np.argwhere(wrong)[0]
+            i += first
+            raise InputError(
+                f"targets[{i}, {s}], outcomes[{i}, {s}]",
+                (int(targets[i, s]), int(outcomes[i, s])),
+                "target 0 for a fall, outcome 0 (STEP) with any other target",
+            )
 
 
 def _slope_index(slopes: np.ndarray, slope: float, field: str) -> int:
@@ -310,6 +356,9 @@ class MeshGrowth:
     ----------
     initial_state, slopes, threshold, initial_slope, clustered, scale_refresh, max_states
         As for `grow_mesh`.
+    answers : Answers, optional
+        Where to keep the answers, and maybe those of an equal mesh that was not finished; in
+        memory by default.
 
     Raises
     ------
@@ -327,6 +376,7 @@ class MeshGrowth:
         clustered: bool = True,
         scale_refresh: str = "generation",
         max_states: int = DEFAULT_MAX_STATES,
+        answers: Answers | None = None,
     ) -> None:
         self._slopes = check_slopes(slopes)
         first = checked_array("initial_state", initial_state, np.float64, (STATE_SIZE,))
@@ -344,11 +394,18 @@ class MeshGrowth:
         self._found.extend(
             first[np.newaxis], self._clusters(self._preceding[1:]), np.ones(STATE_SIZE), threshold
         )
-        self._answers: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._answered = 0
+        self._answers: Answers = AnswersInMemory() if answers is None else answers
+        self._answered = sum(self._answers.rows(start) for start in self._answers)
+        self._resumed = self._answered
         self._tested = 1
         self._starts = [1, 2]
         self._scales: np.ndarray | None = None
+        self._advance()
+
+    @property
+    def resumed(self) -> int:
+        """Number of states whose answers were there from the beginning."""
+        return self._resumed
 
     @property
     def known(self) -> int:
@@ -375,6 +432,20 @@ class MeshGrowth:
         start, stop = self._starts[number : number + 2]
         return start, self._found.states[start:stop].copy(), self._preceding[start:stop].copy()
 
+    def unanswered(self, start: int, most: int) -> tuple[int, int]:
+        """The first range of at most that many states from ``start`` on that have no answer.
+
+        Only answers that were there from the beginning are skipped: who calls this knows of the
+        others.
+        """
+        stop = min(start + most, self.known)
+        if self._resumed:
+            while start in self._answers:
+                start += self._answers.rows(start)
+            stop = min(start + most, self.known)
+            stop = next((i for i in range(start + 1, stop) if i in self._answers), stop)
+        return start, max(start, stop)
+
     def states(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
         """States to simulate, shape (n, 10), and the slopes behind them in rad, shape (n,)."""
         return (
@@ -397,9 +468,9 @@ class MeshGrowth:
         end = self._starts[-1]
         if start < end < start + n:
             reached = int(np.count_nonzero(outcomes[: end - start] == Outcome.STEP))
-            self._answers[start] = outcomes[: end - start], successors[:reached]
+            self._answers.put(start, outcomes[: end - start], successors[:reached])
             start, outcomes, successors = end, outcomes[end - start :], successors[reached:]
-        self._answers[start] = outcomes, successors
+        self._answers.put(start, outcomes, successors)
         self._answered += n
         self._advance()
 
@@ -422,7 +493,7 @@ class MeshGrowth:
                 tried, reached = zip(*self._pieces(self._tested, end), strict=True)
                 self._test(np.concatenate(tried), np.concatenate(reached))
             elif self._tested in self._answers:
-                self._test(*self._answers[self._tested])
+                self._test(*self._answers.get(self._tested))
             else:
                 return
 
@@ -440,8 +511,8 @@ class MeshGrowth:
     def _pieces(self, start: int, stop: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Answers for a range of states, in the order of the states."""
         while start < stop:
-            yield self._answers[start]
-            start += len(self._answers[start][0])
+            yield self._answers.get(start)
+            start += self._answers.rows(start)
 
     def _test(self, outcomes: np.ndarray, successors: np.ndarray) -> None:
         """Test the successors of the next states."""

@@ -67,6 +67,13 @@ class Growth(Protocol):
     def known(self) -> int:
         """Number of states so far, the failure state counted; all of them may be simulated."""
 
+    @property
+    def resumed(self) -> int:
+        """Number of states whose answers were there from the beginning."""
+
+    def unanswered(self, start: int, most: int) -> tuple[int, int]:
+        """The first range of at most that many states from ``start`` on that have no answer."""
+
     def states(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
         """States, shape (n, 10), and the slopes behind them, shape (n,)."""
 
@@ -124,7 +131,7 @@ class Job:
     @property
     def frontier(self) -> int:
         """States known that have not been simulated."""
-        return self.growth.known - 1 - self.tally.swings
+        return self.growth.known - 1 - self.growth.resumed - self.tally.swings
 
 
 @dataclass(eq=False)
@@ -273,9 +280,10 @@ class FanOut:
                 return job._again.popleft()
             ready = job.growth.known - job._handed_out
             if ready > 0:
-                start = job._handed_out
-                job._handed_out = start + self._size(job, ready)
-                return _Chunk(job, start, job._handed_out)
+                start, stop = job.growth.unanswered(job._handed_out, self._size(job, ready))
+                job._handed_out = stop
+                if stop > start:
+                    return _Chunk(job, start, stop)
         return None
 
     def _size(self, job: Job, ready: int) -> int:
@@ -388,7 +396,7 @@ class FanOut:
             if simulator.asked and not simulator.late:
                 self._check_late(simulator, now)
         if self.simulators or not self._jobs:
-            if self._waiting:
+            if self._waiting and self.simulators:
                 self._log("there is a simulator again: going on")
             self._usable, self._waiting = now, False
             return

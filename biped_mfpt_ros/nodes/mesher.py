@@ -39,6 +39,11 @@ class MesherParameters(NodeParameters):
     chunks_in_flight: int = parameter(2, "requests that each simulator has at once", 1, 100)
     progress_period: float = parameter(0.25, "s, between two progress messages", 0.05, 60.0)
     meshes_at_once: int = parameter(4, "meshes that grow at the same time", 1, 64)
+    checkpoint_directory: str = parameter(
+        "",
+        "where meshes that grow are kept on disk; a goal like one that was not finished resumes "
+        "it. Empty: not kept",
+    )
     max_queued: int = parameter(
         64, "goals that may wait for their turn; further ones are rejected", 0, 1000
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import re
 import secrets
 import threading
@@ -9,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +22,11 @@ from biped_mfpt_msgs.srv import SimulateSteps
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from biped_mfpt_ros.chain.mesh import Mesh, MeshGrowth, MeshLimitError
+from biped_mfpt_ros.chain.journal import Journal, JournalInUse
+from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES, Mesh, MeshGrowth, MeshLimitError
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import NoLimitCycle, find_limit_cycle
-from biped_mfpt_ros.jit import STEP_MAP
+from biped_mfpt_ros.jit import KERNELS, STEP_MAP
 from biped_mfpt_ros.nodes.fan_out import FanOut, FanOutSettings, Job, NoSimulatorError, Simulators
 from biped_mfpt_ros.nodes.messages import (
     MeshSettings,
@@ -51,6 +55,37 @@ def new_mesh_id(controller: str) -> str:
     """A name that no other mesh has: the controller's, the time (UTC), and a random number."""
     label = re.sub(r"[^A-Za-z0-9.]+", "-", controller)[:64].strip("-") or "mesh"
     return f"{label}-{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(3)}"
+
+
+def open_journal(settings: MeshSettings, directory: str) -> Journal:
+    """Journal of a mesh, with what is there of it if it was begun before.
+
+    Parameters
+    ----------
+    settings : MeshSettings
+        Of the mesh, with the initial state.
+    directory : str
+        Where named journals are; made if missing. Empty: the journal gets no name.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made, read or written.
+    """
+    m = len(settings.slopes)
+    if not directory:
+        return Journal(m)
+    # Neither the label of the controller nor the limit changes an answer or a state.
+    message = settings_message(dataclasses.replace(settings, max_states=DEFAULT_MAX_STATES))
+    message.controller.name = ""
+    # Not the bytes of the serialised message: what lies between its fields is random.
+    identity = f"{STEP_MAP} {KERNELS} {message!r}".encode()
+    folder = Path(directory)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        return Journal(m, identity, folder / f"{hashlib.sha256(identity).hexdigest()[:32]}.journal")
+    except JournalInUse:  # by an equal goal, which grows now
+        return Journal(m)
 
 
 class Meshes:
@@ -154,6 +189,7 @@ class _Growing:
 
     job: Job
     _settings: MeshSettings
+    _journal: Journal | None = None
 
     def __init__(
         self,
@@ -173,8 +209,12 @@ class _Growing:
         try:
             return do(*args)
         except Cancelled:
-            self._end(MeshInfo.CANCELLED, "cancelled")
-        except (InputError, NoLimitCycle, MeshLimitError, NoSimulatorError) as error:
+            self._end(MeshInfo.CANCELLED, "cancelled", resumable=not self._goal.is_cancel_requested)
+        except NoSimulatorError as error:
+            self._end(MeshInfo.FAILED, str(error), resumable=True)
+        except OSError as error:
+            self._end(MeshInfo.FAILED, f"the mesh could not be kept: {error}", resumable=True)
+        except (InputError, NoLimitCycle, MeshLimitError) as error:
             self._end(MeshInfo.FAILED, str(error))
         except Exception as error:
             # When the context has ended, it only tells that nothing can be published any more.
@@ -191,6 +231,9 @@ class _Growing:
         initial = settings.initial_state
         if initial is None:
             initial = find_limit_cycle(settings.controller, model=settings.model).state
+        settings = dataclasses.replace(settings, initial_state=initial)
+        directory = self._meshes.parameters().checkpoint_directory
+        self._journal = open_journal(settings, directory)
         growth = MeshGrowth(
             initial,
             settings.slopes,
@@ -199,7 +242,12 @@ class _Growing:
             clustered=settings.clustered,
             scale_refresh=settings.scale_refresh,
             max_states=settings.max_states,
+            answers=self._journal,
         )
+        if growth.resumed:
+            self._meshes.node.get_logger().info(
+                f"resuming a mesh of {settings.controller.name}: {growth.resumed} states are there"
+            )
         self.job = Job(
             growth,
             SimulateSteps.Request(
@@ -242,8 +290,12 @@ class _Growing:
             self._meshes.transitions.publish(message)
         self._end(MeshInfo.COMPLETE, mesh=mesh)
 
-    def _end(self, status: int, message: str = "", mesh: Mesh | None = None) -> None:
+    def _end(
+        self, status: int, message: str = "", mesh: Mesh | None = None, *, resumable: bool = False
+    ) -> None:
         self.ended = True
+        if self._journal is not None:
+            self._journal.close(remove=not resumable)
         if not self._meshes.node.context.ok():
             return
         result = GrowMesh.Result(success=status == MeshInfo.COMPLETE, message=message)
@@ -255,6 +307,7 @@ class _Growing:
             result.states = growth.known
             result.generations = growth.generations
             result.swings = tally.swings
+            result.swings_resumed = growth.resumed
             result.chunks_repeated = tally.chunks_repeated
             result.seconds = time.monotonic() - self._start
             result.step_map_seconds = tally.step_map_seconds
@@ -284,6 +337,7 @@ class _Growing:
             states=job.growth.known,
             frontier=job.frontier,
             swings=job.tally.swings,
+            swings_resumed=job.growth.resumed,
             simulators=fan_out.simulators,
             chunks_in_flight=fan_out.in_flight(job),
             chunks_repeated=job.tally.chunks_repeated,

@@ -1,0 +1,136 @@
+"""A mesher that is killed: the next one goes on where it was, and ends with the same mesh."""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from biped_mfpt_msgs.msg import MeshInfo
+from ros_graph import Client, ros_graph, wait_for
+from test_nodes import assert_same_mesh, grown_here, settings
+
+from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.nodes.mesher import Mesher
+from biped_mfpt_ros.nodes.simulator import Simulator
+
+MFPT = controller("hzd/mfpt")
+CHUNK = 20
+IN_FLIGHT = 2
+
+
+class Counting(Simulator):
+    """Counts the states that it simulates, and takes its time for it."""
+
+    count = 0
+
+    def _simulate(self, request, response):
+        self.count += len(request.previous_slopes)
+        time.sleep(0.02)
+        return super()._simulate(request, response)
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        yield graph
+
+
+@pytest.fixture
+def tester(graph):
+    return graph.start(Client)
+
+
+@pytest.fixture(scope="module")
+def goal():
+    state = find_limit_cycle(MFPT).state
+    return settings(controller=MFPT, threshold=0.02, initial_state=state)
+
+
+@pytest.fixture(scope="module")
+def mesh_here(goal):
+    return grown_here(goal, goal.initial_state)
+
+
+def launch(graph, name, directory):
+    return graph.launch(
+        "mesher", "--ros-args", "-r", f"__node:={name}", "-p", f"checkpoint_directory:={directory}",
+        "-p", "chunk_seconds:=0.001", "-p", "simulator_wait_seconds:=60.0",
+    )  # fmt: skip
+
+
+def journals(directory):
+    return sorted(path.name for path in directory.glob("*"))
+
+
+@pytest.mark.parametrize(("sent", "kills"), [(signal.SIGKILL, 3), (signal.SIGTERM, 1)])
+def test_mesher_killed_again_and_again_ends_with_the_same_mesh(
+    graph, tester, goal, mesh_here, tmp_path, sent, kills
+):
+    simulators = [graph.start(lambda name=name: Counting(name)) for name in ("one", "two")]
+    n = len(mesh_here.states) - 1
+    rng = np.random.default_rng(1)
+    for kill in range(kills):
+        mesher = launch(graph, f"mesher_{kill}", tmp_path)
+        answered = sum(s.count for s in simulators)
+        assert tester.send_goal_to(f"mesher_{kill}", goal).accepted
+        more = int(rng.integers(n // 8, n // 6))
+        wait_for(lambda more=more, a=answered: sum(s.count for s in simulators) > a + more, "work")
+        mesher.send_signal(sent)
+        mesher.wait(10.0)
+        assert len(journals(tmp_path)) == 1, kill
+    launch(graph, "mesher", tmp_path)
+    handle = tester.send_goal_to("mesher", goal)
+    status, result = tester.outcome(handle)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert_same_mesh(tester.mesh(result.mesh_id), mesh_here)
+    assert result.swings + result.swings_resumed == n
+    assert result.swings_resumed > kills * n // 10
+    # At most the chunks in flight were simulated again, for each kill.
+    simulated = sum(s.count for s in simulators)
+    assert n <= simulated <= n + kills * len(simulators) * IN_FLIGHT * CHUNK
+    assert journals(tmp_path) == []
+
+
+def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_cancelled_one(
+    graph, tester, goal, mesh_here, tmp_path
+):
+    simulator = graph.start(Counting)
+    graph.start(
+        Mesher, checkpoint_directory=str(tmp_path), simulator_wait_seconds=0.3,
+        simulator_timeout=0.1, chunk_seconds=0.001,
+    )  # fmt: skip
+    handle = tester.send_goal(goal)
+    wait_for(lambda: simulator.count > 100, "work")
+    graph.stop(simulator)
+    status, result = tester.outcome(handle)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "no simulator answered" in result.message
+    assert len(journals(tmp_path)) == 1
+    again = graph.start(lambda: Counting("again"))
+    handle = tester.send_goal(goal)
+    wait_for(lambda: again.count > 20, "work")
+    assert len(journals(tmp_path)) == 1
+    handle.cancel_goal_async()
+    assert tester.outcome(handle)[0] == GoalStatus.STATUS_CANCELED
+    assert journals(tmp_path) == []
+    # Equal goals side by side do not share a journal, and a directory that cannot be is said.
+    one, two = tester.send_goal(goal), tester.send_goal(goal)
+    for handle in (one, two):
+        status, result = tester.outcome(handle)
+        assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+        assert result.swings_resumed == 0
+        assert_same_mesh(tester.mesh(result.mesh_id), mesh_here)
+    assert journals(tmp_path) == []
+
+
+def test_a_directory_that_cannot_be_written_is_an_error_that_says_so(graph, tester, goal, tmp_path):
+    (tmp_path / "file").touch()
+    graph.start(Simulator)
+    graph.start(Mesher, checkpoint_directory=str(tmp_path / "file"))
+    status, result = tester.grow(goal)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "could not be kept" in result.message
+    assert str(tmp_path / "file") in result.message
+    assert [info.status for info in tester.infos] in ([], [MeshInfo.FAILED])
