@@ -19,7 +19,14 @@ from biped_mfpt_ros import __version__
 
 _PACKAGE = Path(__file__).parent
 # What decides the result of a step: the kernels and the robot's data.
-_STEP_SOURCES = ("walker/*.py", "control/*.py", "gait/*.py", "data/rabbit.json", "jit.py")
+_STEP_SOURCES = (
+    "walker/*.py",
+    "control/*.py",
+    "gait/*.py",
+    "data/rabbit.json",
+    "jit.py",
+    "lanes.py",
+)
 _KERNEL_SOURCES = (*_STEP_SOURCES, "chain/*.py")
 
 

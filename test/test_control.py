@@ -68,10 +68,11 @@ def outputs(name, parameters, q, dq, ddq):
 
 def motion(control, state, switched=False, model=FREE):
     """Accelerations ddq and torques under a controller."""
-    rate, work = np.empty(11), np.zeros((dynamics.WORKSPACE_ROWS, 5))
+    rate, torques = np.empty(11), np.empty(4)
     y = np.append(dynamics.to_absolute(state), 0.0)
-    closed_loop(control.code, switched, model.packed(), control.packed(model.robot), work, y, rate)
-    return np.linalg.solve(ABSOLUTE, rate[5:10]), work[dynamics.TORQUE, :4].copy()
+    packed = control.packed(model.robot)
+    closed_loop(control.code, switched, model.packed(), packed, y, rate, torques)
+    return np.linalg.solve(ABSOLUTE, rate[5:10]), torques
 
 
 @pytest.mark.parametrize("name", HZD_NAMES)

@@ -95,13 +95,13 @@ def test_accelerations_and_ground_force_agree_with_newton_euler():
         scale = np.abs(expected).max()
         assert np.abs(found - expected).max() <= 1e-9 * max(1.0, scale)
 
-        work = np.zeros((dynamics.WORKSPACE_ROWS, 5))
-        dynamics.set_angles(work, np.concatenate([a, da]))
-        work[dynamics.ACC] = ABSOLUTE @ found
-        ground = dynamics.row_sum(packed, work, np.concatenate([a, da]))
+        s, c = dynamics.sines(tuple(a))
+        dda = tuple(ABSOLUTE @ found)
+        ground = dynamics.ground_force(packed, s, c, tuple(da), dda)
         # The multiplier is the force on the ground.
         assert np.allclose(ground, -solution[23:25], rtol=1e-9, atol=1e-8)
-        assert np.allclose(work[dynamics.TORQUE, :4], u, rtol=1e-9, atol=1e-8)
+        required = dynamics.required_torques(packed, s, c, tuple(da), dda)
+        assert np.allclose(required, u, rtol=1e-9, atol=1e-8)
 
 
 def test_prescribed_motion_fulfils_the_equations_of_motion():
@@ -109,16 +109,18 @@ def test_prescribed_motion_fulfils_the_equations_of_motion():
     packed = WalkerModel().packed()
     for state in STATES:
         y = dynamics.to_absolute(state)
-        work = np.zeros((dynamics.WORKSPACE_ROWS, 5))
-        dynamics.set_angles(work, y)
-        work[dynamics.ALPHA] = RNG.normal(0, 30, 5)
-        work[dynamics.BETA] = [1.0, 0.0, 1.0, 0.0, 0.0]  # sliding mode: never singular
-        factor = dynamics.prescribed_motion(packed, work, y)
-        if abs(factor) < 0.1:  # kg m^2, of some 10: next to singular, rounding is magnified
+        s, c = dynamics.sines(tuple(y[:5]))
+        da = tuple(y[5:])
+        alpha = tuple(RNG.normal(0, 30, 5))
+        beta = (1.0, 0.0, 1.0, 0.0, 0.0)  # sliding mode
+        inertia = ABSOLUTE.T @ np.linalg.inv(
+            ABSOLUTE @ np.linalg.inv(dynamics.inertia_matrix(state[:5], ROBOT)) @ ABSOLUTE.T
+        )
+        if abs(inertia[4] @ beta) < 0.1:  # kg m^2: next to singular, rounding is magnified
             continue
-        acceleration = work[dynamics.ACC].copy()
-        dynamics.row_sum(packed, work, y)
-        found = ABSOLUTE @ dynamics.accelerations(state, work[dynamics.TORQUE, :4], ROBOT)
+        acceleration = np.array(dynamics.prescribed_motion(packed, s, c, da, alpha, beta))
+        torques = dynamics.required_torques(packed, s, c, da, tuple(acceleration))
+        found = ABSOLUTE @ dynamics.accelerations(state, np.array(torques), ROBOT)
         assert np.allclose(found, acceleration, rtol=1e-9, atol=1e-9 * np.abs(acceleration).max())
 
 

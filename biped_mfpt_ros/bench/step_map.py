@@ -52,11 +52,10 @@ def scipy_swing(name: str, repetitions: int) -> np.ndarray:
     state, _, _ = reached(control)
     duration = simulate_steps(control, [state], [0.0], SLOPES).durations[0, 0]
     rob, par = model.packed(), control.packed(model.robot)
-    work = np.zeros((dynamics.WORKSPACE_ROWS, 5))
-    rate = np.empty(11)
+    rate, torques = np.empty(11), np.empty(4)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        closed_loop(control.code, False, rob, par, work, y, rate)
+        closed_loop(control.code, False, rob, par, y, rate, torques)
         return rate.copy()
 
     start = np.append(dynamics.to_absolute(state), 0.0)

@@ -13,7 +13,6 @@ import numpy as np
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.walker.dynamics import ALPHA, BETA
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import ABSOLUTE, Robot, rabbit
 
@@ -33,47 +32,56 @@ PACKED_SIZE = _MONOMIAL + 4 * (DEGREE + 1)
 
 
 @kernel
-def command(par, work, y):
-    """Accelerations ``alpha + beta z`` with ``z = ddtheta``, into the workspace (eq. 8 to 13)."""
-    theta = -0.5 * (y[0] + y[2])
-    rate = -0.5 * (y[5] + y[7])
-    tau = (theta - par[_THETA_START]) * par[_SLOPE]
-    tau_rate = rate * par[_SLOPE]
-    for i in range(4):
-        k = _MONOMIAL + i * (DEGREE + 1)
-        value = par[k + DEGREE]
-        first = 0.0
-        second = 0.0
-        for n in range(DEGREE - 1, -1, -1):
-            second = second * tau + first
-            first = first * tau + value
-            value = value * tau + par[k + n]
-        base = 4 if i < 2 else i - 2
-        error = y[i] - y[base] - value
-        error_rate = y[5 + i] - y[5 + base] - first * tau_rate
-        work[BETA, i] = first * par[_SLOPE]
-        work[ALPHA, i] = (
-            2.0 * second * tau_rate * tau_rate - par[_KP] * error - par[_KD] * error_rate
-        )
-    # ddq_i = A_i + B_i z and z = -ddq_1 - ddq_3 / 2 - ddq_5 give the torso, then the other links.
-    alpha5 = -work[ALPHA, 0] - 0.5 * work[ALPHA, 2]
-    beta5 = -1.0 - work[BETA, 0] - 0.5 * work[BETA, 2]
-    work[ALPHA, 4] = alpha5
-    work[BETA, 4] = beta5
-    for i in range(2):
-        work[ALPHA, i] += alpha5
-        work[BETA, i] += beta5
-    for i in range(2, 4):
-        work[ALPHA, i] += work[ALPHA, i - 2]
-        work[BETA, i] += work[BETA, i - 2]
+def _reference(par, k, tau):
+    """A polynomial of degree 6 with its first and second derivative, by Horner's rule."""
+    top = par[k + DEGREE]
+    value = top * tau + par[k + 5]
+    first = top * tau + value
+    value = value * tau + par[k + 4]
+    half = top * tau + first
+    first = first * tau + value
+    value = value * tau + par[k + 3]
+    for n in range(2, -1, -1):
+        half = half * tau + first
+        first = first * tau + value
+        value = value * tau + par[k + n]
+    return value, first, 2.0 * half
 
 
 @kernel
-def switch(par, y):
+def _output(par, i, tau, tau_rate, angle, rate):
+    """Acceleration ``A + B z`` of one output (eq. 8 to 10)."""
+    value, first, second = _reference(par, _MONOMIAL + i * (DEGREE + 1), tau)
+    error = angle - value
+    error_rate = rate - first * tau_rate
+    return (
+        second * tau_rate * tau_rate - par[_KP] * error - par[_KD] * error_rate,
+        first * par[_SLOPE],
+    )
+
+
+@kernel
+def command(par, a, da):
+    """Accelerations ``alpha + beta z`` of the five links with ``z = ddtheta`` (eq. 8 to 13)."""
+    tau = (-0.5 * (a[0] + a[2]) - par[_THETA_START]) * par[_SLOPE]
+    rate = -0.5 * (da[0] + da[2]) * par[_SLOPE]
+    a1, b1 = _output(par, 0, tau, rate, a[0] - a[4], da[0] - da[4])
+    a2, b2 = _output(par, 1, tau, rate, a[1] - a[4], da[1] - da[4])
+    a3, b3 = _output(par, 2, tau, rate, a[2] - a[0], da[2] - da[0])
+    a4, b4 = _output(par, 3, tau, rate, a[3] - a[1], da[3] - da[1])
+    # z = -ddq_1 - ddq_3 / 2 - ddq_5 gives the torso, then the other links.
+    a5 = -a1 - 0.5 * a3
+    b5 = -1.0 - b1 - 0.5 * b3
+    a1, b1, a2, b2 = a1 + a5, b1 + b5, a2 + a5, b2 + b5
+    return (a1, a2, a3 + a1, a4 + a2, a5), (b1, b2, b3 + b1, b4 + b2, b5)
+
+
+@kernel
+def switch(par, a):
     """Positive as long as torques are applied: ``tau_off - tau``."""
     if par[_OFF] == math.inf:
         return 1.0
-    tau = (-0.5 * (y[0] + y[2]) - par[_THETA_START]) * par[_SLOPE]
+    tau = (-0.5 * (a[0] + a[2]) - par[_THETA_START]) * par[_SLOPE]
     return par[_OFF] - tau
 
 

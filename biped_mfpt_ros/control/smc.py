@@ -27,7 +27,6 @@ import numpy as np
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.walker.dynamics import ALPHA, BETA
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot
 
@@ -84,45 +83,28 @@ def _law(sigma, rate, k, exponent, width):
 
 
 @kernel
-def command(par, work, y, after_switch):
-    """Accelerations ``alpha + beta z`` with ``z`` that of the stance femur, into the workspace."""
+def _output(par, i, after_switch, value, rate):
+    """Acceleration of one output (eq. 18, 21)."""
     ref = _REF2 if after_switch else _REF1
-    for i in range(4):
-        if i == 0:
-            value, rate = y[1], y[6]
-        elif i == 1:
-            value, rate = y[2] - y[0], y[7] - y[5]
-        elif i == 2:
-            value, rate = y[3] - y[1], y[8] - y[6]
-        else:
-            value, rate = y[4], y[9]
-        error = value - par[ref + i]
-        inverse_tau = par[_RATE + i]
-        sigma = rate + error * inverse_tau
-        v = -_law(
-            sigma, rate * inverse_tau, par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
-        )
-        if i == 0:
-            work[ALPHA, 1] = v
-            work[ALPHA, 3] = v
-        elif i == 1:
-            work[ALPHA, 2] = v
-        elif i == 2:
-            work[ALPHA, 3] += v
-        else:
-            work[ALPHA, 4] = v
-    work[ALPHA, 0] = 0.0
-    work[BETA, 0] = 1.0
-    work[BETA, 1] = 0.0
-    work[BETA, 2] = 1.0
-    work[BETA, 3] = 0.0
-    work[BETA, 4] = 0.0
+    inverse_tau = par[_RATE + i]
+    sigma = rate + (value - par[ref + i]) * inverse_tau
+    return -_law(sigma, rate * inverse_tau, par[_K + i], par[_EXPONENT + i], par[_WIDTH + i])
 
 
 @kernel
-def switch(par, y):
+def command(par, a, da, after_switch):
+    """Accelerations ``alpha + beta z`` of the five links, ``z`` that of the stance femur."""
+    v2 = _output(par, 0, after_switch, a[1], da[1])
+    v3 = _output(par, 1, after_switch, a[2] - a[0], da[2] - da[0])
+    v4 = _output(par, 2, after_switch, a[3] - a[1], da[3] - da[1])
+    v5 = _output(par, 3, after_switch, a[4], da[4])
+    return (0.0, v2, v3, v2 + v4, v5), (1.0, 0.0, 1.0, 0.0, 0.0)
+
+
+@kernel
+def switch(par, a):
     """Positive before the switch of the references: theta_1 - pi (eq. 22)."""
-    return y[0] - math.pi
+    return a[0] - math.pi
 
 
 def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.ndarray:

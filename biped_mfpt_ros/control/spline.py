@@ -23,7 +23,7 @@ import numpy as np
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.walker.dynamics import ALPHA, BETA, swing_foot
+from biped_mfpt_ros.walker.dynamics import swing_foot
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot, WalkerModel
 
@@ -54,47 +54,41 @@ _BASIS = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) 
 
 
 @kernel
-def command(par, work, y):
-    """Accelerations ``alpha + beta z`` with ``z = ddtheta``, into the workspace."""
-    theta = -0.5 * (y[0] + y[2])
-    rate = -0.5 * (y[5] + y[7])
-    at = (theta - par[_START]) * par[_INVERSE]
+def _output(par, i, piece, at, rate, value, value_rate):
+    """Acceleration ``alpha + first z`` of one output."""
+    k = _PIECE + 16 * piece + 4 * i
+    a1, a2, a3 = par[k + 1], par[k + 2], par[k + 3]
+    reference = par[k] + at * (a1 + at * (a2 + at * a3))
+    first = (a1 + at * (2.0 * a2 + 3.0 * at * a3)) * par[_INVERSE]
+    second = (2.0 * a2 + 6.0 * at * a3) * par[_INVERSE] * par[_INVERSE]
+    alpha = (
+        second * rate * rate
+        - par[_KP + i] * (value - reference)
+        - par[_KD + i] * (value_rate - first * rate)
+    )
+    return alpha, first
+
+
+@kernel
+def command(par, a, da):
+    """Accelerations ``alpha + beta z`` of the five links with ``z = ddtheta``."""
+    rate = -0.5 * (da[0] + da[2])
+    at = (-0.5 * (a[0] + a[2]) - par[_START]) * par[_INVERSE]
     if not at > 0.0:  # also where it is not a number
         at = 0.0
     elif at > _PIECES - 1.0:
         at = _PIECES - 1.0
     piece = int(at)
     at -= piece
-    for i in range(4):
-        k = _PIECE + 16 * piece + 4 * i
-        a1, a2, a3 = par[k + 1], par[k + 2], par[k + 3]
-        reference = par[k] + at * (a1 + at * (a2 + at * a3))
-        first = (a1 + at * (2.0 * a2 + 3.0 * at * a3)) * par[_INVERSE]
-        second = (2.0 * a2 + 6.0 * at * a3) * par[_INVERSE] * par[_INVERSE]
-        if i == 0:
-            value, value_rate = y[1], y[6]
-        elif i == 1:
-            value, value_rate = y[2] - y[0], y[7] - y[5]
-        elif i == 2:
-            value, value_rate = y[3] - y[1], y[8] - y[6]
-        else:
-            value, value_rate = y[4], y[9]
-        alpha = (
-            second * rate * rate
-            - par[_KP + i] * (value - reference)
-            - par[_KD + i] * (value_rate - first * rate)
-        )
-        # a_1 = -theta - q3 / 2 and a_3 = -theta + q3 / 2.
-        if i == 0:
-            work[ALPHA, 1], work[BETA, 1] = alpha, first
-        elif i == 1:
-            work[ALPHA, 0], work[BETA, 0] = -0.5 * alpha, -1.0 - 0.5 * first
-            work[ALPHA, 2], work[BETA, 2] = 0.5 * alpha, -1.0 + 0.5 * first
-        elif i == 2:
-            work[ALPHA, 3] = work[ALPHA, 1] + alpha
-            work[BETA, 3] = work[BETA, 1] + first
-        else:
-            work[ALPHA, 4], work[BETA, 4] = alpha, first
+    v2, b2 = _output(par, 0, piece, at, rate, a[1], da[1])
+    v3, b3 = _output(par, 1, piece, at, rate, a[2] - a[0], da[2] - da[0])
+    v4, b4 = _output(par, 2, piece, at, rate, a[3] - a[1], da[3] - da[1])
+    v5, b5 = _output(par, 3, piece, at, rate, a[4], da[4])
+    # a_1 = -theta - q3 / 2 and a_3 = -theta + q3 / 2.
+    return (
+        (-0.5 * v3, v2, 0.5 * v3, v2 + v4, v5),
+        (-1.0 - 0.5 * b3, b2, -1.0 + 0.5 * b3, b2 + b4, b5),
+    )
 
 
 def references(parameters: np.ndarray, theta: float) -> np.ndarray:

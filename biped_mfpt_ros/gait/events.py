@@ -7,27 +7,64 @@ from __future__ import annotations
 
 import math
 
-from biped_mfpt_ros.gait.closed_loop import closed_loop, margin, switch
-from biped_mfpt_ros.gait.integrate import SPARE, Y_AT, interpolate
+from biped_mfpt_ros.gait.closed_loop import beyond, margin, mode_of, motion, switch
+from biped_mfpt_ros.gait.integrate import state_at
+from biped_mfpt_ros.gait.scratch import FEET
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.walker import robot as r
-from biped_mfpt_ros.walker.dynamics import swing_foot
+from biped_mfpt_ros.walker.dynamics import foot, sines
 
 TIME_RESOLUTION = 1e-12
 """s, to which events are located."""
 
+_SAMPLES = 4  # of a step in which a torque reaches its limit
+CUT_RESOLUTION = 1e-9
+"""Of the torque limit: how far a torque may be beyond it before it is cut off."""
+
 
 @kernel
-def foot_root(rob, s, nx, ny, offset, low, high, span):
+def next_guess(low, low_value, high, high_value):
+    """Where a function that changes sign between two places would vanish if it were linear."""
+    at = low + (high - low) * (low_value / (low_value - high_value))
+    return at if low < at < high else 0.5 * (low + high)
+
+
+@kernel
+def foot_at(rob, w, lane, at):
+    """Position and velocity of the swing foot: x, y (m), dx, dy (m/s)."""
+    a, da = state_at(w, lane, at)
+    s, c = sines(a)
+    return foot(rob, s, c, da)
+
+
+@kernel
+def cubic_root(f0, d0, f1, d1):
+    """Where the cubic with values f0 > 0 >= f1 and slopes d0, d1 at 0 and 1 vanishes, about."""
+    low, high = 0.0, 1.0
+    at = f0 / (f0 - f1)
+    c2 = 3.0 * (f1 - f0) - 2.0 * d0 - d1
+    c3 = 2.0 * (f0 - f1) + d0 + d1
+    for _ in range(3):
+        value = f0 + at * (d0 + at * (c2 + at * c3))
+        if value > 0.0:
+            low = at
+        else:
+            high = at
+        at = at - value / (d0 + at * (2.0 * c2 + 3.0 * at * c3))
+        if not low < at < high:
+            at = 0.5 * (low + high)
+    return at
+
+
+@kernel
+def foot_root(rob, w, lane, nx, ny, offset, low, high, at, span):
     """Where ``nx x + ny y - offset`` of the swing foot falls through zero, by a guarded Newton.
 
     ``low`` and ``high`` are fractions of the step, of ``span`` seconds, with a positive value at
-    ``low`` and one not above zero at ``high``.
+    ``low`` and one not above zero at ``high``; ``at`` is a guess.
     """
-    at = 0.5 * (low + high)
     for _ in range(100):
-        interpolate(s, at)
-        x, y, dx, dy = swing_foot(rob, s[Y_AT])
+        x, y, dx, dy = foot_at(rob, w, lane, at)
         value = nx * x + ny * y - offset
         if value > 0.0:
             low = at
@@ -44,12 +81,11 @@ def foot_root(rob, s, nx, ny, offset, low, high, span):
 
 
 @kernel
-def foot_lowest(rob, s, nx, ny, low, high):
+def foot_lowest(rob, w, lane, nx, ny, low, high):
     """Where ``nx x + ny y`` of the swing foot is least, given that it falls, then rises."""
     for _ in range(50):
         at = 0.5 * (low + high)
-        interpolate(s, at)
-        _, _, dx, dy = swing_foot(rob, s[Y_AT])
+        _, _, dx, dy = foot_at(rob, w, lane, at)
         if nx * dx + ny * dy < 0.0:
             low = at
         else:
@@ -58,15 +94,62 @@ def foot_lowest(rob, s, nx, ny, low, high):
 
 
 @kernel
-def switch_root(scheme, par, s, switched, high, span):
+def may_dip(f0, d0, f1, d1):
+    """Whether a smooth function with these values and slopes at 0 and 1 may fall to zero between.
+
+    The cubic through them is above the least of its four control points. What the function differs
+    from it is covered by 3 mm and a tenth of what they spread.
+    """
+    p0, p1 = f0 + d0 / 3.0, f1 - d1 / 3.0
+    least = min(min(f0, p0), min(p1, f1))
+    most = max(max(f0, p0), max(p1, f1))
+    return not least > 3e-3 + 0.1 * (most - least)
+
+
+@kernel
+def first_below(rob, w, lane, nx, ny, offset, low, at_low, high, at_high, parts, span):
+    """When the swing foot first comes down to ``nx x + ny y = offset``, 2 if not before ``high``.
+
+    ``at_low`` and ``at_high`` are the foot there, as `foot_at` gives it. The step is looked at in
+    so many equal ``parts`` that within each the foot moves one way at most, and back; the foot
+    between them stands in row FEET.
+    """
+    x, y, dx, dy = at_low
+    f0, d0 = nx * x + ny * y - offset, (nx * dx + ny * dy) * span
+    k = int(low * parts)
+    while low < high:
+        k += 1
+        until = high
+        x, y, dx, dy = at_high
+        if k < parts and k < high * parts:
+            until = k / parts
+            i = 4 * (k - 1)
+            x, y = w[FEET, i, lane], w[FEET, i + 1, lane]
+            dx, dy = w[FEET, i + 2, lane], w[FEET, i + 3, lane]
+        f1, d1 = nx * x + ny * y - offset, (nx * dx + ny * dy) * span
+        length = until - low
+        if not f1 > 0.0:
+            at = low + length * cubic_root(f0, length * d0, f1, length * d1)
+            return foot_root(rob, w, lane, nx, ny, offset, low, until, at, span)
+        if d0 < 0.0 and d1 > 0.0 and may_dip(f0, length * d0, f1, length * d1):
+            at = foot_lowest(rob, w, lane, nx, ny, low, until)
+            x, y, _, _ = foot_at(rob, w, lane, at)
+            if not nx * x + ny * y - offset > 0.0:
+                return foot_root(rob, w, lane, nx, ny, offset, low, at, 0.5 * (low + at), span)
+        low, f0, d0 = until, f1, d1
+    return 2.0
+
+
+@kernel
+def switch_root(scheme, par, w, lane, switched, span):
     """Where the controller switches, as a fraction of the step: just on the far side."""
-    low = 0.0
+    low, high = 0.0, 1.0
     while (high - low) * span > TIME_RESOLUTION:
         at = 0.5 * (low + high)
         if at <= low or at >= high:
             break
-        interpolate(s, at)
-        if (switch(scheme, par, s[Y_AT]) > 0.0) != switched:
+        a, _ = state_at(w, lane, at)
+        if (switch(scheme, par, a) > 0.0) != switched:
             low = at
         else:
             high = at
@@ -74,63 +157,133 @@ def switch_root(scheme, par, s, switched, high, span):
 
 
 @kernel
-def body_point(rob, y, i):
-    """Position of stance knee (0), hip (1), swing knee (2) or head (3), m."""
-    x = rob[r.TIBIA] * math.sin(y[2])
-    h = -rob[r.TIBIA] * math.cos(y[2])
-    if i >= 1:
-        x += rob[r.FEMUR] * math.sin(y[0])
-        h -= rob[r.FEMUR] * math.cos(y[0])
-    if i == 2:
-        x -= rob[r.FEMUR] * math.sin(y[1])
-        h += rob[r.FEMUR] * math.cos(y[1])
-    elif i == 3:
-        x -= rob[r.TORSO] * math.sin(y[4])
-        h += rob[r.TORSO] * math.cos(y[4])
-    return x, h
+def motion_at(scheme, rob, par, w, lane, at):
+    """Torques wanted and acting (N m), force on the stance foot (N), at a fraction of the step."""
+    a, da = state_at(w, lane, at)
+    cut, switched = mode_of(w, lane)
+    _, wanted, applied, force, _, _ = motion(scheme, rob, par, cut, switched, a, da)
+    return wanted, applied, force
 
 
 @kernel
-def body_touches(rob, y, previous, slope):
-    """Whether a knee, the hip or the head is below the ground."""
+def first_change(scheme, rob, par, w, lane, span):
+    """When the first torque reaches its limit, or leaves it, and which.
+
+    Returns
+    -------
+    tuple
+        Fraction of the step, the joint and whether it is held at the limit from then on: 0 or the
+        sign of its torque; 2, -1 and 0 if none does. Evaluations made.
+    """
+    cut, _ = mode_of(w, lane)
+    slack = CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
+    low, high = 0.0, 0.0
+    low_value, high_value = -slack, -slack
+    evaluations = 0
+    for k in range(1, _SAMPLES + 1):
+        low, low_value = high, high_value
+        high = k / _SAMPLES
+        wanted, _, _ = motion_at(scheme, rob, par, w, lane, high)
+        evaluations += 1
+        high_value = beyond(rob, cut, wanted)
+        if not high_value <= slack:
+            break
+    if high_value <= slack:
+        return 2.0, -1, 0.0, evaluations
+    # Illinois: regula falsi, halving the value of an end that stays.
+    low_value = min(low_value, -slack)
+    at = high
+    side = 0
+    for _ in range(60):
+        at = next_guess(low, low_value, high, high_value)
+        wanted, _, _ = motion_at(scheme, rob, par, w, lane, at)
+        evaluations += 1
+        value = beyond(rob, cut, wanted)
+        if abs(value) <= 0.1 * slack or (high - low) * span < TIME_RESOLUTION:
+            break
+        if value > 0.0:
+            high, high_value = at, value
+            if side == 1:
+                low_value *= 0.5
+            side = 1
+        else:
+            low, low_value = at, value
+            if side == -1:
+                high_value *= 0.5
+            side = -1
+    joint = 0
+    farthest = -math.inf
     for i in range(4):
-        x, h = body_point(rob, y, i)
-        ground = slope if x >= 0.0 else previous
-        if h * math.cos(ground) - x * math.sin(ground) <= 0.0:
-            return True
-    return False
+        one = (
+            abs(wanted[i]) - rob[r.TORQUE_LIMIT]
+            if cut[i] == 0.0
+            else rob[r.TORQUE_LIMIT] - cut[i] * wanted[i]
+        )
+        if one > farthest:
+            joint, farthest = i, one
+    held = 0.0
+    if cut[joint] == 0.0:
+        held = 1.0 if wanted[joint] > 0.0 else -1.0
+    return at, joint, held, evaluations
 
 
 @kernel
-def body_root(rob, s, previous, slope, low, high):
+def slip_root(scheme, rob, par, w, lane, low, low_value, high, high_value, span):
+    """When the stance foot begins (or ends) to slip: where the margin changes its sign."""
+    if (low_value > 0.0) == (high_value > 0.0):
+        return low  # it had begun (or ended) with a jump, there
+    side = 0
+    at = high
+    for _ in range(60):
+        at = next_guess(low, low_value, high, high_value)
+        _, _, force = motion_at(scheme, rob, par, w, lane, at)
+        value = margin(rob, force)
+        if abs(value) < 1e-9 * rob[r.MASS] * rob[r.GRAVITY] or (high - low) * span < 1e-10:
+            break
+        if (value > 0.0) == (high_value > 0.0):
+            high, high_value = at, value
+            if side == 1:
+                low_value *= 0.5
+            side = 1
+        else:
+            low, low_value = at, value
+            if side == -1:
+                high_value *= 0.5
+            side = -1
+    return at
+
+
+@kernel
+def body_touches(rob, s, c, previous, slope):
+    """Whether a knee, the hip or the head is below the ground; ``slope``s as (sine, cosine)."""
+    tibia, femur = rob[r.TIBIA], rob[r.FEMUR]
+    knee_x, knee_y = tibia * s[2], -tibia * c[2]
+    hip_x, hip_y = knee_x + femur * s[0], knee_y - femur * c[0]
+    return (
+        _below(knee_x, knee_y, previous, slope)
+        or _below(hip_x, hip_y, previous, slope)
+        or _below(hip_x - femur * s[1], hip_y + femur * c[1], previous, slope)
+        or _below(hip_x - rob[r.TORSO] * s[4], hip_y + rob[r.TORSO] * c[4], previous, slope)
+    )
+
+
+@kernel
+def _below(x, y, previous, slope):
+    """Whether a point is below the ground, that of the preceding slope behind the stance foot."""
+    sine, cosine = slope if x >= 0.0 else previous
+    return y * cosine - x * sine <= 0.0
+
+
+@kernel
+def body_root(rob, w, lane, previous, slope, high):
     """When a body point first goes below the ground, given that it does at ``high``."""
+    low = 0.0
     for _ in range(50):
         at = 0.5 * (low + high)
-        interpolate(s, at)
-        if body_touches(rob, s[Y_AT], previous, slope):
+        a, _ = state_at(w, lane, at)
+        s, c = sines(a)
+        if body_touches(rob, s, c, previous, slope):
             high = at
         else:
             low = at
-    return high
-
-
-@kernel
-def forces_at(scheme, switched, rob, par, work, s, at):
-    """Force on the stance foot at a fraction of the step: tangential, normal, N."""
-    interpolate(s, at)
-    return closed_loop(scheme, switched, rob, par, work, s[Y_AT], s[SPARE])
-
-
-@kernel
-def slip_root(scheme, switched, rob, par, work, s, low, high, span, slips_at_high):
-    """When the stance foot begins (or ends) to slip, as a fraction of the step."""
-    while (high - low) * span > 1e-10:
-        at = 0.5 * (low + high)
-        if at <= low or at >= high:
-            break
-        tangential, normal = forces_at(scheme, switched, rob, par, work, s, at)
-        if (margin(rob, tangential, normal) > 0.0) == slips_at_high:
-            low = at
-        else:
-            high = at
     return high

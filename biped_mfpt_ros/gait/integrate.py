@@ -1,12 +1,12 @@
-"""One step of the integrator, and its dense output.
+"""One step of the integrator in all lanes, and its dense output.
 
-Dormand and Prince's pair of order 5(4) with Shampine's quartic dense output [1]_. A pair of order 8
-was tried: on smooth swings it takes half the evaluations, but where torques saturate the right-hand
-side has kinks, and there it takes more.
+Dormand and Prince's pair of order 8(5,3) with the dense output of order 7 that Hairer made for it
+[1]_. Torque limits and controllers' switches are events, so that a step is smooth.
 
 References
 ----------
-.. [1] L. F. Shampine, "Some Practical Runge-Kutta Formulas", Mathematics of Computation 46 (1986).
+.. [1] E. Hairer, S. P. Norsett and G. Wanner, "Solving Ordinary Differential Equations I", 2nd
+   edition, Springer 1993, section II.5 and the code DOP853.
 """
 
 from __future__ import annotations
@@ -15,116 +15,425 @@ import math
 
 import numpy as np
 
-from biped_mfpt_ros.gait.closed_loop import closed_loop, margin
+from biped_mfpt_ros.gait.closed_loop import (
+    any_cut,
+    beyond,
+    lanes_motion,
+    margin,
+    powers,
+)
+from biped_mfpt_ros.gait.scratch import (
+    BEYOND,
+    COSINES,
+    CUT,
+    DENSE,
+    END,
+    ERROR_3,
+    ERROR_5,
+    ESTIMATE,
+    LEAST,
+    LEAST_NORMAL,
+    MODE,
+    MOST,
+    NORMAL,
+    SINES,
+    SIZE,
+    SPARE,
+    STAGE,
+    STATES,
+    TANGENTIAL,
+    WANTED,
+    WORK,
+    Y_NEW,
+    H,
+    Y,
+)
 from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.lanes import load, select, store
 from biped_mfpt_ros.walker import robot as r
-from biped_mfpt_ros.walker.dynamics import TORQUE
-from biped_mfpt_ros.walker.robot import STATE_SIZE
 
-STAGES = 6
-"""Evaluations of a step; one more row holds the derivative at its end, the next step's first."""
-ORDER = 5
+STAGES = 12
+"""Evaluations of a step: the last, at its end, is the next step's first."""
+DENSE_STAGES = 3
+"""Further evaluations for the dense output."""
+ORDER = 8
 
 # Written out, and compared with scipy's in the tests: importing scipy.integrate for them would cost
-# every process half a second.
-_A = np.array(
+# every process half a second. Stage by stage: of which earlier stages it takes how much.
+_STAGES = (
+    ((0, 0.05260015195876773),),
+    (
+        (0, 0.0197250569845379),
+        (1, 0.0591751709536137),
+    ),
+    (
+        (0, 0.02958758547680685),
+        (2, 0.08876275643042054),
+    ),
+    (
+        (0, 0.2413651341592667),
+        (2, -0.8845494793282861),
+        (3, 0.924834003261792),
+    ),
+    (
+        (0, 0.037037037037037035),
+        (3, 0.17082860872947386),
+        (4, 0.12546768756682242),
+    ),
+    (
+        (0, 0.037109375),
+        (3, 0.17025221101954405),
+        (4, 0.06021653898045596),
+        (5, -0.017578125),
+    ),
+    (
+        (0, 0.03709200011850479),
+        (3, 0.17038392571223998),
+        (4, 0.10726203044637328),
+        (5, -0.015319437748624402),
+        (6, 0.008273789163814023),
+    ),
+    (
+        (0, 0.6241109587160757),
+        (3, -3.3608926294469414),
+        (4, -0.868219346841726),
+        (5, 27.59209969944671),
+        (6, 20.154067550477894),
+        (7, -43.48988418106996),
+    ),
+    (
+        (0, 0.47766253643826434),
+        (3, -2.4881146199716677),
+        (4, -0.590290826836843),
+        (5, 21.230051448181193),
+        (6, 15.279233632882423),
+        (7, -33.28821096898486),
+        (8, -0.020331201708508627),
+    ),
+    (
+        (0, -0.9371424300859873),
+        (3, 5.186372428844064),
+        (4, 1.0914373489967295),
+        (5, -8.149787010746927),
+        (6, -18.52006565999696),
+        (7, 22.739487099350505),
+        (8, 2.4936055526796523),
+        (9, -3.0467644718982196),
+    ),
+    (
+        (0, 2.273310147516538),
+        (3, -10.53449546673725),
+        (4, -2.0008720582248625),
+        (5, -17.9589318631188),
+        (6, 27.94888452941996),
+        (7, -2.8589982771350235),
+        (8, -8.87285693353063),
+        (9, 12.360567175794303),
+        (10, 0.6433927460157636),
+    ),
+    (
+        (0, 0.054293734116568765),
+        (5, 4.450312892752409),
+        (6, 1.8915178993145003),
+        (7, -5.801203960010585),
+        (8, 0.3111643669578199),
+        (9, -0.1521609496625161),
+        (10, 0.20136540080403034),
+        (11, 0.04471061572777259),
+    ),
+    (
+        (0, 0.056167502283047954),
+        (6, 0.25350021021662483),
+        (7, -0.2462390374708025),
+        (8, -0.12419142326381637),
+        (9, 0.15329179827876568),
+        (10, 0.00820105229563469),
+        (11, 0.007567897660545699),
+        (12, -0.008298),
+    ),
+    (
+        (0, 0.03183464816350214),
+        (5, 0.028300909672366776),
+        (6, 0.053541988307438566),
+        (7, -0.05492374857139099),
+        (10, -0.00010834732869724932),
+        (11, 0.0003825710908356584),
+        (12, -0.00034046500868740456),
+        (13, 0.1413124436746325),
+    ),
+    (
+        (0, -0.42889630158379194),
+        (5, -4.697621415361164),
+        (6, 7.683421196062599),
+        (7, 4.06898981839711),
+        (8, 0.3567271874552811),
+        (12, -0.0013990241651590145),
+        (13, 2.9475147891527724),
+        (14, -9.15095847217987),
+    ),
+)
+_ERROR_5 = np.array(
     [
-        [0, 0, 0, 0, 0, 0],
-        [1 / 5, 0, 0, 0, 0, 0],
-        [3 / 40, 9 / 40, 0, 0, 0, 0],
-        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
-        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+        0.01312004499419488,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        -1.2251564463762044,
+        -0.4957589496572502,
+        1.6643771824549864,
+        -0.35032884874997366,
+        0.3341791187130175,
+        0.08192320648511571,
+        -0.022355307863886294,
     ]
 )
-_E = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40])
-_P = np.array(
+_ERROR_3 = np.array(
     [
-        [1, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432],
-        [0, 0, 0, 0],
-        [0, 131558114200 / 32700410799, -68118460800 / 10900136933, 87487479700 / 32700410799],
-        [0, -1754552775 / 470086768, 14199869525 / 1410260304, -10690763975 / 1880347072],
+        -0.18980075407240762,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        4.450312892752409,
+        1.8915178993145003,
+        -5.801203960010585,
+        -0.4226823213237919,
+        -0.1521609496625161,
+        0.20136540080403034,
+        0.02265179219836082,
+    ]
+)
+_DENSE = np.array(
+    [
         [
-            0,
-            127303824393 / 49829197408,
-            -318862633887 / 49829197408,
-            701980252875 / 199316789632,
+            -8.428938276109013,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.5667149535193777,
+            -3.0689499459498917,
+            2.38466765651207,
+            2.117034582445028,
+            -0.871391583777973,
+            2.2404374302607883,
+            0.6315787787694688,
+            -0.08899033645133331,
+            18.148505520854727,
+            -9.194632392478356,
+            -4.436036387594894,
         ],
-        [0, -282668133 / 205662961, 2019193451 / 616988883, -1453857185 / 822651844],
-        [0, 40617522 / 29380423, -110615467 / 29380423, 69997945 / 29380423],
+        [
+            10.427508642579134,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            242.28349177525817,
+            165.20045171727028,
+            -374.5467547226902,
+            -22.113666853125306,
+            7.733432668472264,
+            -30.674084731089398,
+            -9.332130526430229,
+            15.697238121770845,
+            -31.139403219565178,
+            -9.35292435884448,
+            35.81684148639408,
+        ],
+        [
+            19.985053242002433,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            -387.0373087493518,
+            -189.17813819516758,
+            527.8081592054236,
+            -11.57390253995963,
+            6.8812326946963,
+            -1.0006050966910838,
+            0.7777137798053443,
+            -2.778205752353508,
+            -60.19669523126412,
+            84.32040550667716,
+            11.99229113618279,
+        ],
+        [
+            -25.69393346270375,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            -154.18974869023643,
+            -231.5293791760455,
+            357.6391179106141,
+            93.40532418362432,
+            -37.45832313645163,
+            104.0996495089623,
+            29.8402934266605,
+            -43.53345659001114,
+            96.32455395918828,
+            -39.17726167561544,
+            -149.72683625798564,
+        ],
     ]
 )
 
-_KINK = 100.0  # by which the error is taken for more in a step with a kink
-
-# Rows of the scratch array of a swing, each of SIZE numbers: angles, rates, energy.
-SIZE = STATE_SIZE + 1
-Y, Y_NEW, Y_AT, SPARE, STAGE = 0, 1, 2, 3, 4
-_DENSE = STAGE + STAGES + 1
-ROWS = _DENSE + 4
+_START = np.cumsum([0, 0] + [len(stage) for stage in _STAGES])
+_FROM = np.array([j for stage in _STAGES for j, _ in stage])
+_WEIGHT = np.array([weight for stage in _STAGES for _, weight in stage])
 
 
 @kernel
-def trial_step(scheme, switched, rob, par, work, s, h, saturated):
-    """Try a step of h seconds from row Y, whose derivative stands in row STAGE, to row Y_NEW.
+def _stage(scheme, rob, par, w, h, stage, into, columns, free):
+    """One stage, in all lanes: its state into a row, its derivative into one of its own."""
+    for i in range(columns):
+        total = _WEIGHT[_START[stage]] * load(w, STAGE + _FROM[_START[stage]], i)
+        for n in range(_START[stage] + 1, _START[stage + 1]):
+            total = total + _WEIGHT[n] * load(w, STAGE + _FROM[n], i)
+        store(w, into, i, load(w, Y, i) + h * total)
+    da, dda, wanted, applied, force, s, c = lanes_motion(scheme, rob, par, w, into, free)
+    power = powers(applied, da)
+    row = STAGE + stage
+    for i in range(5):
+        store(w, row, i, da[i])
+        store(w, row, 5 + i, dda[i])
+    for i in range(4):
+        store(w, row, WORK + i, power[i])
+    return wanted, force, s, c
 
-    ``saturated`` tells which torques are cut off at the start. Where that changes within the step,
-    the right-hand side has a kink and the estimate of the error is too low at times, so that it is
-    taken for more.
 
-    Returns
-    -------
-    tuple of float
-        Estimated local error over the tolerance (accepted if at most 1), least and largest margin
-        against slipping and least normal force of the stance foot over the stages, N, and
-        tangential and normal force at the end of the step, N, and which torques are cut off there.
+@kernel
+def trial_step(scheme, rob, par, w):
+    """Try a step in all lanes, from row Y, whose derivative stands in row STAGE, to row Y_NEW.
+
+    Sets the rows ESTIMATE and END.
     """
-    least, most, least_normal = math.inf, -math.inf, math.inf
-    ft, fn = 0.0, 0.0
-    kink = False
+    free = any_cut(scheme, w)
+    h = load(w, MODE, H)
+    cut = (
+        load(w, MODE, CUT),
+        load(w, MODE, CUT + 1),
+        load(w, MODE, CUT + 2),
+        load(w, MODE, CUT + 3),
+    )
+    least = h * 0.0 + math.inf
+    most = -least
+    normal = least
+    over = most
     for stage in range(1, STAGES + 1):
-        for i in range(SIZE):
-            total = 0.0
-            for k in range(stage):
-                total += _A[stage, k] * s[STAGE + k, i]
-            s[Y_NEW, i] = s[Y, i] + h * total
-        ft, fn = closed_loop(scheme, switched, rob, par, work, s[Y_NEW], s[STAGE + stage])
-        kink = kink or work[TORQUE, 4] != saturated
-        m = margin(rob, ft, fn)
-        least = min(least, m)
-        most = max(most, m)
-        least_normal = min(least_normal, fn)
-    error = 0.0
-    for i in range(STATE_SIZE):
-        total = 0.0
-        for k in range(STAGES + 1):
-            total += _E[k] * s[STAGE + k, i]
-        scale = rob[r.TOLERANCE] * (1.0 + max(abs(s[Y, i]), abs(s[Y_NEW, i])))
-        ratio = abs(h * total) / scale
-        if not ratio <= error:  # also where it is not a number
-            error = ratio
-    if kink:
-        error *= _KINK
-    return error, least, most, least_normal, ft, fn, work[TORQUE, 4]
+        columns = SIZE if stage == STAGES else STATES
+        wanted, force, s, c = _stage(scheme, rob, par, w, h, stage, Y_NEW, columns, free)
+        m = margin(rob, force)
+        least = select(m < least, m, least)
+        most = select(m > most, m, most)
+        normal = select(force[1] < normal, force[1], normal)
+        u = beyond(rob, cut, wanted)
+        over = select(u > over, u, over)
+        if stage == STAGES:
+            for i in range(5):
+                store(w, END, SINES + i, s[i])
+                store(w, END, COSINES + i, c[i])
+            for i in range(4):
+                store(w, END, WANTED + i, wanted[i])
+            store(w, ESTIMATE, TANGENTIAL, force[0])
+            store(w, ESTIMATE, NORMAL, force[1])
+    store(w, ESTIMATE, LEAST, least)
+    store(w, ESTIMATE, MOST, most)
+    store(w, ESTIMATE, LEAST_NORMAL, normal)
+    store(w, ESTIMATE, BEYOND, over)
+    order_5 = h * 0.0
+    order_3 = h * 0.0
+    for i in range(STATES):
+        five = _ERROR_5[0] * load(w, STAGE, i)
+        three = _ERROR_3[0] * load(w, STAGE, i)
+        for k in range(5, STAGES):
+            value = load(w, STAGE + k, i)
+            five = five + _ERROR_5[k] * value
+            three = three + _ERROR_3[k] * value
+        before, after = abs(load(w, Y, i)), abs(load(w, Y_NEW, i))
+        scale = rob[r.TOLERANCE] * (1.0 + select(before > after, before, after))
+        five, three = five / scale, three / scale
+        order_5 = order_5 + five * five
+        order_3 = order_3 + three * three
+    store(w, ESTIMATE, ERROR_5, order_5)
+    store(w, ESTIMATE, ERROR_3, order_3)
 
 
 @kernel
-def prepare_dense(s, h):
-    """Compute the dense output of the step of h seconds just accepted, from Y to Y_NEW."""
+def estimated_error(w, lane):
+    """Estimated local error of the step over the tolerance: accepted if at most 1."""
+    five, three = w[ESTIMATE, ERROR_5, lane], w[ESTIMATE, ERROR_3, lane]
+    if five == 0.0 and three == 0.0:
+        return 0.0
+    return w[MODE, H, lane] * five / math.sqrt((five + 0.01 * three) * STATES)
+
+
+@kernel
+def prepare_dense(scheme, rob, par, w):
+    """Compute the dense output of the step just tried, in all lanes."""
+    free = any_cut(scheme, w)
+    h = load(w, MODE, H)
+    for i in range(SIZE):
+        end = load(w, Y_NEW, i)
+        first = end - load(w, Y, i)
+        second = h * load(w, STAGE, i) - first
+        store(w, DENSE, i, first)
+        store(w, DENSE + 1, i, second)
+        store(w, DENSE + 2, i, 2.0 * first - h * (load(w, STAGE, i) + load(w, STAGE + STAGES, i)))
+    for stage in range(STAGES + 1, STAGES + 1 + DENSE_STAGES):
+        _stage(scheme, rob, par, w, h, stage, SPARE, STATES, free)
     for i in range(SIZE):
         for power in range(4):
-            total = 0.0
-            for k in range(STAGES + 1):
-                total += _P[k, power] * s[STAGE + k, i]
-            s[_DENSE + power, i] = h * total
+            total = _DENSE[power, 0] * load(w, STAGE, i)
+            for k in range(5, STAGES + 1 + DENSE_STAGES):
+                total = total + _DENSE[power, k] * load(w, STAGE + k, i)
+            store(w, DENSE + 3 + power, i, h * total)
 
 
 @kernel
-def interpolate(s, at):
-    """Dense output at the fraction ``at`` of the step, into row Y_AT."""
-    for i in range(SIZE):
-        s[Y_AT, i] = s[Y, i] + at * (
-            s[_DENSE, i]
-            + at * (s[_DENSE + 1, i] + at * (s[_DENSE + 2, i] + at * s[_DENSE + 3, i]))
+def interpolate(w, lane, i, at):
+    """Dense output of a column at the fraction ``at`` of the step."""
+    rest = 1.0 - at
+    return w[Y, i, lane] + at * (
+        w[DENSE, i, lane]
+        + rest
+        * (
+            w[DENSE + 1, i, lane]
+            + at
+            * (
+                w[DENSE + 2, i, lane]
+                + rest
+                * (
+                    w[DENSE + 3, i, lane]
+                    + at
+                    * (
+                        w[DENSE + 4, i, lane]
+                        + rest * (w[DENSE + 5, i, lane] + at * w[DENSE + 6, i, lane])
+                    )
+                )
+            )
         )
+    )
+
+
+@kernel
+def state_at(w, lane, at):
+    """Angles and rates at the fraction ``at`` of the step."""
+    a = (
+        interpolate(w, lane, 0, at),
+        interpolate(w, lane, 1, at),
+        interpolate(w, lane, 2, at),
+        interpolate(w, lane, 3, at),
+        interpolate(w, lane, 4, at),
+    )
+    da = (
+        interpolate(w, lane, 5, at),
+        interpolate(w, lane, 6, at),
+        interpolate(w, lane, 7, at),
+        interpolate(w, lane, 8, at),
+        interpolate(w, lane, 9, at),
+    )
+    return a, da

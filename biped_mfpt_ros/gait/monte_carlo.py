@@ -16,8 +16,10 @@ from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait import step
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
-from biped_mfpt_ros.gait.integrate import ROWS, SIZE
+from biped_mfpt_ros.gait.scratch import VARIABLES, empty_scratch
+from biped_mfpt_ros.gait.swing import advance, begin, to_joint
 from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel
@@ -34,37 +36,54 @@ def _walk(scheme, rob, par, states, previous, slopes, steps, outcomes):
     Updates ``states`` and ``previous`` in place, adds the steps taken (that of the fall counted) to
     ``steps`` and puts the last outcome into ``outcomes``.
     """
-    s = np.zeros((ROWS, SIZE))
-    work = np.zeros((dynamics.WORKSPACE_ROWS, 5))
-    after = np.zeros((1, STATE_SIZE))
-    trace = np.zeros((0, step.SAMPLE_COLUMNS))
-    outcome = np.zeros(1, dtype=np.uint8)
-    unused = np.zeros((3, 1))
-    for n in range(states.shape[0]):
-        step._set_state(s, states[n])
-        for k in range(slopes.shape[1]):
-            step._swing(
-                scheme,
-                rob,
-                par,
-                previous[n],
-                slopes[n, k : k + 1],
-                s,
-                work,
-                outcome,
-                unused[0],
-                unused[1],
-                unused[2],
-                after,
-                trace,
-            )
-            steps[n] += 1
-            outcomes[n] = outcome[0]
-            if outcome[0] != _STEP:
-                break
-            previous[n] = slopes[n, k]
-            step._to_joint(after[0], states[n])
-            step._set_state(s, states[n])
+    walks, length = slopes.shape
+    w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
+    after = np.zeros((LANES, 1, STATE_SIZE))
+    lane_outcomes, results = np.zeros((LANES, 1), np.uint8), np.zeros((LANES, 3, 1))
+    ground = np.empty((LANES, 1, 2))
+    active = np.zeros(LANES, np.bool_)
+    of, taken = np.full(LANES, -1), np.zeros(LANES, np.int64)
+    trace = np.zeros((0, 0))
+    started = 0
+    while True:
+        for lane in range(LANES):
+            if active[lane]:
+                continue
+            n = of[lane]
+            if n >= 0:
+                k = taken[lane]
+                steps[n] += 1
+                outcomes[n] = lane_outcomes[lane, 0]
+                if outcomes[n] == _STEP:
+                    previous[n] = slopes[n, k]
+                    to_joint(after[lane, 0], states[n])
+                    taken[lane] += 1
+                if outcomes[n] != _STEP or taken[lane] == length:
+                    n = -1
+            if n < 0 and started < walks:
+                n, taken[lane] = started, 0
+                started += 1
+            of[lane] = n
+            if n >= 0:
+                sine, cosine = dynamics.sine_cosine(slopes[n, taken[lane]])
+                ground[lane, 0, 0], ground[lane, 0, 1] = sine, cosine
+                begin(
+                    scheme,
+                    rob,
+                    par,
+                    w,
+                    v,
+                    lane,
+                    states[n],
+                    previous[n],
+                    ground[lane],
+                    lane_outcomes[lane],
+                    results[lane],
+                )
+                active[lane] = True
+        if not active.any():
+            return
+        advance(scheme, rob, par, w, v, active, ground, lane_outcomes, results, after, trace)
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,34 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
-from biped_mfpt_ros.gait.integrate import ROWS, SIZE
-from biped_mfpt_ros.gait.step import SAMPLE_COLUMNS, _set_state, _swing, check_states
+from biped_mfpt_ros.gait.scratch import SAMPLES, VARIABLES, empty_scratch
+from biped_mfpt_ros.gait.step import check_states
+from biped_mfpt_ros.gait.swing import SAMPLE_COLUMNS, advance, begin
+from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel
 from biped_mfpt_ros.walker.terrain import check_slopes
 
 _MOST_SAMPLES = 20_000
+
+
+@kernel
+def _traced(scheme, rob, par, state, previous, slope, next_state, samples):
+    """Simulate one swing in lane 0; returns the outcome and how many samples were taken."""
+    w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
+    active = np.zeros(LANES, np.bool_)
+    outcomes, results = np.zeros((LANES, 1), np.uint8), np.zeros((LANES, 3, 1))
+    after = np.zeros((LANES, 1, STATE_SIZE))
+    ground = np.empty((LANES, 1, 2))
+    ground[0, 0, 0], ground[0, 0, 1] = dynamics.sine_cosine(slope)
+    begin(scheme, rob, par, w, v, 0, state, previous, ground[0], outcomes[0], results[0])
+    active[0] = True
+    while active[0]:
+        advance(scheme, rob, par, w, v, active, ground, outcomes, results, after, samples)
+    next_state[:] = after[0, 0]
+    return outcomes[0, 0], int(v[SAMPLES, 0])
 
 
 @dataclass(frozen=True)
@@ -82,35 +102,26 @@ def trace_swing(
     model = model or WalkerModel()
     start = check_states(np.asarray(state, dtype=np.float64)[None], "state")[0]
     previous = float(check_slopes([previous_slope], "previous_slope")[0])
-    scratch = np.zeros((ROWS, SIZE))
-    outcome = np.zeros(1, dtype=np.uint8)
-    duration, length, energy = np.zeros((3, 1))
-    after = np.zeros((1, STATE_SIZE))
+    after = np.zeros(STATE_SIZE)
     samples = np.zeros((_MOST_SAMPLES, SAMPLE_COLUMNS))
-    _set_state(scratch, start)
-    _, _, count = _swing(
+    code, count = _traced(
         controller.code,
         model.packed(),
         controller.packed(model.robot),
+        start,
         previous,
-        check_slopes([slope], "slope"),
-        scratch,
-        np.zeros((dynamics.WORKSPACE_ROWS, 5)),
-        outcome,
-        duration,
-        length,
-        energy,
+        float(check_slopes([slope], "slope")[0]),
         after,
         samples,
     )
     samples = samples[:count]
-    fell = outcome[0] != Outcome.STEP
+    outcome = Outcome(code)
     return Trace(
         times=samples[:, 0],
         states=dynamics.to_joint(samples[:, 1:11]),
         torques=samples[:, 11:15],
         forces=samples[:, 15:17],
         energies=samples[:, 17],
-        outcome=Outcome(int(outcome[0])),
-        next_state=None if fell else dynamics.to_joint(after[0]),
+        outcome=outcome,
+        next_state=dynamics.to_joint(after) if outcome == Outcome.STEP else None,
     )

@@ -9,7 +9,12 @@ with the joint torques ``Q = (u1 - u3, u2 - u4, u3, u4, -u1 - u2)``. Their sum h
 is the angular momentum about the stance foot. So where a controller prescribes four accelerations,
 ``dda = alpha + beta z``, that one scalar equation gives ``z``, the others the torques, and no
 system has to be solved (`prescribed_motion`). Where torques are given, the inertia matrix is
-factorised (`free_motion`).
+factorised (`solve`).
+
+Every link beyond a joint hangs from it, so that ``C_ij`` is a product of ``w_j`` and a length for
+most pairs of links, and zero for the torso and the swing leg (`coupling`).
+
+The kernels take five angles, rates, sines ... as tuples, of numbers or of `Lanes`.
 """
 
 from __future__ import annotations
@@ -19,36 +24,19 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.lanes import select
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.robot import ABSOLUTE, C, Robot, W, WalkerModel
-
-# Rows of the workspace of the kernels, each of five numbers: one for each link.
-SIN, COS, ALPHA, BETA, ACC, TORQUE = range(6)
-WORKSPACE_ROWS = 12
-_MATRIX = 6  # five more rows: a factorised inertia matrix
-_RHS = 11
-
 
 # Cephes' polynomials on [-pi/4, pi/4] and pi/2 in three parts (Cody and Waite).
 _TWO_OVER_PI = 2.0 / math.pi
 _PIO2_1, _PIO2_2 = 1.57079625129699707031e0, 7.54978941586159635335e-8
 _PIO2_3 = 5.390302529957765e-15
-_SIN = (
-    1.58962301576546568060e-10,
-    -2.50507477628578072866e-8,
-    2.75573136213857245213e-6,
-    -1.98412698295895385996e-4,
-    8.33333333332211858878e-3,
-    -1.66666666666666307295e-1,
-)
-_COS = (
-    -1.13585365213876817300e-11,
-    2.08757008419747316778e-9,
-    -2.75573141792967388112e-7,
-    2.48015872888517045348e-5,
-    -1.38888888888730564116e-3,
-    4.16666666666665929218e-2,
-)
+_S0, _S1, _S2 = 1.58962301576546568060e-10, -2.50507477628578072866e-8, 2.75573136213857245213e-6
+_S3, _S4, _S5 = -1.98412698295895385996e-4, 8.33333333332211858878e-3, -1.66666666666666307295e-1
+_C0, _C1, _C2 = -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7
+_C3, _C4, _C5 = 2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2
+_ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to an integer
 
 
 @kernel
@@ -58,164 +46,228 @@ def sine_cosine(angle):
     The C library's differ in their last bit from machine to machine, with the instructions that it
     chooses; these do not, so that every machine simulates the same step to the last bit.
     """
-    quadrant = math.floor(angle * _TWO_OVER_PI + 0.5)
+    quadrant = (angle * _TWO_OVER_PI + _ROUND) - _ROUND
     x = ((angle - quadrant * _PIO2_1) - quadrant * _PIO2_2) - quadrant * _PIO2_3
     z = x * x
-    sine = _SIN[0]
-    cosine = _COS[0]
-    for i in range(1, 6):
-        sine = sine * z + _SIN[i]
-        cosine = cosine * z + _COS[i]
-    sine = x + x * z * sine
-    cosine = 1.0 - 0.5 * z + z * z * cosine
-    half = 0.5 * quadrant
-    if half != math.floor(half):
-        sine, cosine = cosine, -sine
-    half = math.floor(half) * 0.5
-    if half != math.floor(half):
-        sine, cosine = -sine, -cosine
-    return sine, cosine
+    sine = x + x * z * (((((_S0 * z + _S1) * z + _S2) * z + _S3) * z + _S4) * z + _S5)
+    cosine = 1.0 - 0.5 * z + z * z * (((((_C0 * z + _C1) * z + _C2) * z + _C3) * z + _C4) * z + _C5)
+    turn = quadrant - 4.0 * ((0.25 * quadrant + _ROUND) - _ROUND)  # -2 to 2
+    odd = abs(turn) == 1.0
+    s = select(odd, cosine, sine)
+    c = select(odd, sine, cosine)
+    s = select((turn < 0.0) | (turn > 1.0), -s, s)
+    c = select((turn > 0.0) | (turn < -1.0), -c, c)
+    return s, c
 
 
 @kernel
-def set_angles(work, y):
-    """Put sines and cosines of the absolute angles ``y[:5]`` into the workspace."""
-    for i in range(5):
-        work[SIN, i], work[COS, i] = sine_cosine(y[i])
+def sines(a):
+    """Sines and cosines of five angles."""
+    s0, c0 = sine_cosine(a[0])
+    s1, c1 = sine_cosine(a[1])
+    s2, c2 = sine_cosine(a[2])
+    s3, c3 = sine_cosine(a[3])
+    s4, c4 = sine_cosine(a[4])
+    return (s0, s1, s2, s3, s4), (c0, c1, c2, c3, c4)
 
 
 @kernel
-def row_sum(rob, work, y):
-    """Right-hand sides of the torques' rows for the accelerations in the workspace.
+def coupling(rob, x):
+    """``C x`` for five numbers, one for each link."""
+    x0, x1, x2, x3, x4 = x
+    beyond = rob[W + 1] * x1 + rob[W + 3] * x3 + rob[W + 4] * x4  # the hip: swing leg and torso
+    hip = rob[r.FEMUR] * x0 + rob[r.TIBIA] * x2
+    return (
+        rob[C] * x0 + rob[C + 2] * x2 - rob[r.FEMUR] * beyond,
+        rob[C + 6] * x1 + rob[C + 8] * x3 - rob[W + 1] * hip,
+        rob[C + 12] * x2 + rob[C + 2] * x0 - rob[r.TIBIA] * beyond,
+        rob[C + 18] * x3 + rob[C + 8] * x1 - rob[W + 3] * hip,
+        rob[C + 24] * x4 - rob[W + 4] * hip,
+    )
 
-    Sets ``work[TORQUE, :4]`` to u1 to u4 (N m) and returns the force of the ground on the stance
-    foot, (tangential, normal) in the vertical frame, N.
-    """
-    s0, s1, s2, s3, s4 = work[SIN, 0], work[SIN, 1], work[SIN, 2], work[SIN, 3], work[SIN, 4]
-    c0, c1, c2, c3, c4 = work[COS, 0], work[COS, 1], work[COS, 2], work[COS, 3], work[COS, 4]
-    q0, q1, q2, q3, q4 = y[5] * y[5], y[6] * y[6], y[7] * y[7], y[8] * y[8], y[9] * y[9]
-    d0, d1, d2, d3, d4 = work[ACC, 0], work[ACC, 1], work[ACC, 2], work[ACC, 3], work[ACC, 4]
-    # Second derivative of e(a_j) is -(x_j, y_j).
-    x0, x1, x2 = c0 * d0 - s0 * q0, c1 * d1 - s1 * q1, c2 * d2 - s2 * q2
-    x3, x4 = c3 * d3 - s3 * q3, c4 * d4 - s4 * q4
-    y0, y1, y2 = s0 * d0 + c0 * q0, s1 * d1 + c1 * q1, s2 * d2 + c2 * q2
-    y3, y4 = s3 * d3 + c3 * q3, s4 * d4 + c4 * q4
+
+@kernel
+def weighted(rob, x):
+    """``sum_i w_i x_i`` for five numbers, one for each link."""
+    return (
+        rob[W] * x[0]
+        + rob[W + 1] * x[1]
+        + rob[W + 2] * x[2]
+        + rob[W + 3] * x[3]
+        + rob[W + 4] * x[4]
+    )
+
+
+@kernel
+def _foot_acceleration(s, c, da, dda):
+    """Second derivatives of the five ``-e(a_i)``: tuples of x and of y."""
+    q0, q1, q2 = da[0] * da[0], da[1] * da[1], da[2] * da[2]
+    q3, q4 = da[3] * da[3], da[4] * da[4]
+    x = (
+        c[0] * dda[0] - s[0] * q0,
+        c[1] * dda[1] - s[1] * q1,
+        c[2] * dda[2] - s[2] * q2,
+        c[3] * dda[3] - s[3] * q3,
+        c[4] * dda[4] - s[4] * q4,
+    )
+    y = (
+        s[0] * dda[0] + c[0] * q0,
+        s[1] * dda[1] + c[1] * q1,
+        s[2] * dda[2] + c[2] * q2,
+        s[3] * dda[3] + c[3] * q3,
+        s[4] * dda[4] + c[4] * q4,
+    )
+    return x, y
+
+
+@kernel
+def ground_force(rob, s, c, da, dda):
+    """Force of the ground on the stance foot in the vertical frame: tangential, normal, N."""
+    x, y = _foot_acceleration(s, c, da, dda)
+    return -weighted(rob, x), rob[r.MASS] * rob[r.GRAVITY] - weighted(rob, y)
+
+
+@kernel
+def required_torques(rob, s, c, da, dda):
+    """Torques u1 to u4 for given accelerations, N m."""
+    x, y = _foot_acceleration(s, c, da, dda)
+    u = coupling(rob, x)
+    v = coupling(rob, y)
     g = rob[r.GRAVITY]
-    for i in range(4):
-        k = C + 5 * i
-        u = rob[k] * x0 + rob[k + 1] * x1 + rob[k + 2] * x2 + rob[k + 3] * x3 + rob[k + 4] * x4
-        v = rob[k] * y0 + rob[k + 1] * y1 + rob[k + 2] * y2 + rob[k + 3] * y3 + rob[k + 4] * y4
-        work[TORQUE, i] = (
-            work[COS, i] * u
-            + work[SIN, i] * (v - g * rob[W + i])
-            + rob[r.I_LINK + i] * work[ACC, i]
-        )
-    work[TORQUE, 0] += work[TORQUE, 2]
-    work[TORQUE, 1] += work[TORQUE, 3]
-    tangential = -(
-        rob[W] * x0 + rob[W + 1] * x1 + rob[W + 2] * x2 + rob[W + 3] * x3 + rob[W + 4] * x4
-    )
-    normal = rob[r.MASS] * g - (
-        rob[W] * y0 + rob[W + 1] * y1 + rob[W + 2] * y2 + rob[W + 3] * y3 + rob[W + 4] * y4
-    )
-    return tangential, normal
+    q0 = c[0] * u[0] + s[0] * (v[0] - g * rob[W]) + rob[r.I_LINK] * dda[0]
+    q1 = c[1] * u[1] + s[1] * (v[1] - g * rob[W + 1]) + rob[r.I_LINK + 1] * dda[1]
+    q2 = c[2] * u[2] + s[2] * (v[2] - g * rob[W + 2]) + rob[r.I_LINK + 2] * dda[2]
+    q3 = c[3] * u[3] + s[3] * (v[3] - g * rob[W + 3]) + rob[r.I_LINK + 3] * dda[3]
+    return (q0 + q2, q1 + q3, q2, q3)
 
 
 @kernel
-def prescribed_motion(rob, work, y):
-    """Accelerations ``alpha + beta z`` that fulfil the torque-free equation.
+def prescribed_motion(rob, s, c, da, alpha, beta):
+    """Accelerations ``alpha + beta z`` that fulfil the torque-free equation, rad/s^2.
 
-    Reads SIN, COS, ALPHA and BETA of the workspace, sets ACC (rad/s^2). Returns the factor of
-    ``z``; where it vanishes the controller cannot be realised and ACC is not finite.
+    Where the factor of ``z`` vanishes, the controller cannot be realised and they are not finite.
     """
-    s0, s1, s2, s3, s4 = work[SIN, 0], work[SIN, 1], work[SIN, 2], work[SIN, 3], work[SIN, 4]
-    c0, c1, c2, c3, c4 = work[COS, 0], work[COS, 1], work[COS, 2], work[COS, 3], work[COS, 4]
-    factor = 0.0
-    rest = 0.0
-    for j in range(5):
-        k = C + 5 * j
-        p = rob[k] * c0 + rob[k + 1] * c1 + rob[k + 2] * c2 + rob[k + 3] * c3 + rob[k + 4] * c4
-        q = rob[k] * s0 + rob[k + 1] * s1 + rob[k + 2] * s2 + rob[k + 3] * s3 + rob[k + 4] * s4
-        inertia = work[COS, j] * p + work[SIN, j] * q + rob[r.I_LINK + j]
-        centrifugal = q * work[COS, j] - p * work[SIN, j]
-        factor += inertia * work[BETA, j]
-        rest += (
-            inertia * work[ALPHA, j]
-            + centrifugal * y[5 + j] * y[5 + j]
-            - rob[r.GRAVITY] * rob[W + j] * work[SIN, j]
-        )
+    p = coupling(rob, c)
+    q = coupling(rob, s)
+    d0 = c[0] * p[0] + s[0] * q[0] + rob[r.I_LINK]
+    d1 = c[1] * p[1] + s[1] * q[1] + rob[r.I_LINK + 1]
+    d2 = c[2] * p[2] + s[2] * q[2] + rob[r.I_LINK + 2]
+    d3 = c[3] * p[3] + s[3] * q[3] + rob[r.I_LINK + 3]
+    d4 = c[4] * p[4] + s[4] * q[4] + rob[r.I_LINK + 4]
+    centrifugal = (
+        (q[0] * c[0] - p[0] * s[0]) * da[0] * da[0]
+        + (q[1] * c[1] - p[1] * s[1]) * da[1] * da[1]
+        + (q[2] * c[2] - p[2] * s[2]) * da[2] * da[2]
+        + (q[3] * c[3] - p[3] * s[3]) * da[3] * da[3]
+        + (q[4] * c[4] - p[4] * s[4]) * da[4] * da[4]
+    )
+    rest = (d0 * alpha[0] + d1 * alpha[1] + d2 * alpha[2] + d3 * alpha[3] + d4 * alpha[4]) + (
+        centrifugal - rob[r.GRAVITY] * weighted(rob, s)
+    )
+    factor = d0 * beta[0] + d1 * beta[1] + d2 * beta[2] + d3 * beta[3] + d4 * beta[4]
     z = -rest / factor
-    for j in range(5):
-        work[ACC, j] = work[ALPHA, j] + work[BETA, j] * z
-    return factor
+    return (
+        alpha[0] + beta[0] * z,
+        alpha[1] + beta[1] * z,
+        alpha[2] + beta[2] * z,
+        alpha[3] + beta[3] * z,
+        alpha[4] + beta[4] * z,
+    )
 
 
 @kernel
-def free_motion(rob, work, y):
-    """Accelerations under the joint torques in the workspace (eq. 2).
+def solve(rob, s, c, right):
+    """Solve ``D x = right``, D the inertia matrix, by an L D L^T factorisation.
 
-    Reads SIN, COS and TORQUE of the workspace, sets ACC (rad/s^2), by a Cholesky factorisation of
-    the inertia matrix.
+    The torso and the swing tibia come first: they are coupled to few links.
     """
-    u0, u1, u2, u3 = work[TORQUE, 0], work[TORQUE, 1], work[TORQUE, 2], work[TORQUE, 3]
-    work[_RHS, 0] = u0 - u2
-    work[_RHS, 1] = u1 - u3
-    work[_RHS, 2] = u2
-    work[_RHS, 3] = u3
-    work[_RHS, 4] = -u0 - u1
-    for i in range(5):
-        total = rob[r.GRAVITY] * rob[W + i] * work[SIN, i]
-        for j in range(5):
-            sine = work[SIN, i] * work[COS, j] - work[COS, i] * work[SIN, j]
-            total -= rob[C + 5 * i + j] * sine * y[5 + j] * y[5 + j]
-        work[_RHS, i] += total
-        for j in range(i + 1):
-            cosine = work[COS, i] * work[COS, j] + work[SIN, i] * work[SIN, j]
-            work[_MATRIX + i, j] = rob[C + 5 * i + j] * cosine
-        work[_MATRIX + i, i] += rob[r.I_LINK + i]
-    solve_spd(work, _MATRIX, _RHS, ACC)
+    i = r.I_LINK
+    d44 = rob[C + 24] + rob[i + 4]
+    d40 = rob[C + 20] * (c[4] * c[0] + s[4] * s[0])
+    d42 = rob[C + 22] * (c[4] * c[2] + s[4] * s[2])
+    d33 = rob[C + 18] + rob[i + 3]
+    d30 = rob[C + 15] * (c[3] * c[0] + s[3] * s[0])
+    d31 = rob[C + 16] * (c[3] * c[1] + s[3] * s[1])
+    d32 = rob[C + 17] * (c[3] * c[2] + s[3] * s[2])
+    d10 = rob[C + 5] * (c[1] * c[0] + s[1] * s[0])
+    d12 = rob[C + 7] * (c[1] * c[2] + s[1] * s[2])
+    d02 = rob[C + 2] * (c[0] * c[2] + s[0] * s[2])
+    d00, d11, d22 = rob[C] + rob[i], rob[C + 6] + rob[i + 1], rob[C + 12] + rob[i + 2]
+
+    l40, l42 = d40 / d44, d42 / d44
+    l30, l31, l32 = d30 / d33, d31 / d33, d32 / d33
+    d00 = d00 - l40 * d40 - l30 * d30
+    d02 = d02 - l40 * d42 - l30 * d32
+    d22 = d22 - l42 * d42 - l32 * d32
+    d11 = d11 - l31 * d31
+    d10 = d10 - l31 * d30
+    d12 = d12 - l31 * d32
+    inverse = 1.0 / d11
+    l10, l12 = d10 * inverse, d12 * inverse
+    d00 = d00 - l10 * d10
+    d02 = d02 - l10 * d12
+    d22 = d22 - l12 * d12
+    l02 = d02 / d00
+    d22 = d22 - l02 * d02
+
+    y1 = right[1] - l31 * right[3]
+    y0 = right[0] - l40 * right[4] - l30 * right[3] - l10 * y1
+    y2 = right[2] - l42 * right[4] - l32 * right[3] - l12 * y1 - l02 * y0
+    x2 = y2 / d22
+    x0 = y0 / d00 - l02 * x2
+    x1 = y1 * inverse - l10 * x0 - l12 * x2
+    x3 = right[3] / d33 - l30 * x0 - l31 * x1 - l32 * x2
+    x4 = right[4] / d44 - l40 * x0 - l42 * x2
+    return (x0, x1, x2, x3, x4)
 
 
 @kernel
-def solve_spd(work, matrix, right, out):
-    """Solve a 5x5 symmetric positive definite system in place, by Cholesky (L D L^T).
+def free_motion(rob, s, c, da, u):
+    """Accelerations under the torques u1 to u4 (eq. 2), rad/s^2."""
+    qc = (
+        c[0] * da[0] * da[0],
+        c[1] * da[1] * da[1],
+        c[2] * da[2] * da[2],
+        c[3] * da[3] * da[3],
+        c[4] * da[4] * da[4],
+    )
+    qs = (
+        s[0] * da[0] * da[0],
+        s[1] * da[1] * da[1],
+        s[2] * da[2] * da[2],
+        s[3] * da[3] * da[3],
+        s[4] * da[4] * da[4],
+    )
+    p = coupling(rob, qc)
+    q = coupling(rob, qs)
+    g = rob[r.GRAVITY]
+    right = (
+        u[0] - u[2] + s[0] * (g * rob[W] - p[0]) + c[0] * q[0],
+        u[1] - u[3] + s[1] * (g * rob[W + 1] - p[1]) + c[1] * q[1],
+        u[2] + s[2] * (g * rob[W + 2] - p[2]) + c[2] * q[2],
+        u[3] + s[3] * (g * rob[W + 3] - p[3]) + c[3] * q[3],
+        -u[0] - u[1] + s[4] * (g * rob[W + 4] - p[4]) + c[4] * q[4],
+    )
+    return solve(rob, s, c, right)
 
-    The lower triangle stands in the rows ``matrix`` to ``matrix + 4``, the right-hand side in the
-    row ``right``, and the solution goes into the row ``out`` of the workspace.
-    """
-    for j in range(5):
-        for k in range(j):
-            product = work[matrix + j, k] * work[matrix + k, k]
-            work[matrix + j, j] -= work[matrix + j, k] * product
-            for i in range(j + 1, 5):
-                work[matrix + i, j] -= work[matrix + i, k] * product
-        inverse = 1.0 / work[matrix + j, j]
-        for i in range(j + 1, 5):
-            work[matrix + i, j] *= inverse
-    for i in range(5):
-        total = work[right, i]
-        for k in range(i):
-            total -= work[matrix + i, k] * work[out, k]
-        work[out, i] = total
-    for i in range(4, -1, -1):
-        total = work[out, i] / work[matrix + i, i]
-        for k in range(i + 1, 5):
-            total -= work[matrix + k, i] * work[out, k]
-        work[out, i] = total
+
+@kernel
+def foot(rob, s, c, da):
+    """Position and velocity of the swing foot from the stance foot: x, y (m), dx, dy (m/s)."""
+    femur, tibia = rob[r.FEMUR], rob[r.TIBIA]
+    return (
+        femur * (s[0] - s[1]) + tibia * (s[2] - s[3]),
+        femur * (c[1] - c[0]) + tibia * (c[3] - c[2]),
+        femur * (c[0] * da[0] - c[1] * da[1]) + tibia * (c[2] * da[2] - c[3] * da[3]),
+        femur * (s[0] * da[0] - s[1] * da[1]) + tibia * (s[2] * da[2] - s[3] * da[3]),
+    )
 
 
 @kernel
 def swing_foot(rob, y):
-    """Position and velocity of the swing foot from the stance foot: x, y (m), dx, dy (m/s)."""
-    femur, tibia = rob[r.FEMUR], rob[r.TIBIA]
-    s0, s1, s2, s3 = math.sin(y[0]), math.sin(y[1]), math.sin(y[2]), math.sin(y[3])
-    c0, c1, c2, c3 = math.cos(y[0]), math.cos(y[1]), math.cos(y[2]), math.cos(y[3])
-    return (
-        femur * (s0 - s1) + tibia * (s2 - s3),
-        femur * (c1 - c0) + tibia * (c3 - c2),
-        femur * (c0 * y[5] - c1 * y[6]) + tibia * (c2 * y[7] - c3 * y[8]),
-        femur * (s0 * y[5] - s1 * y[6]) + tibia * (s2 * y[7] - s3 * y[8]),
-    )
+    """Position and velocity of the swing foot, for angles and rates in an array."""
+    s, c = sines((y[0], y[1], y[2], y[3], y[4]))
+    return foot(rob, s, c, (y[5], y[6], y[7], y[8], y[9]))
 
 
 def to_absolute(states: np.ndarray) -> np.ndarray:
@@ -262,12 +314,11 @@ def accelerations(state: np.ndarray, torques: np.ndarray, robot: Robot) -> np.nd
     numpy.ndarray
         ddq, rad/s^2, shape (5,).
     """
-    work = np.zeros((WORKSPACE_ROWS, 5))
     y = to_absolute(np.asarray(state, dtype=np.float64))
-    set_angles(work, y)
-    work[TORQUE, :4] = torques
-    free_motion(WalkerModel(robot=robot).packed(), work, y)
-    return np.linalg.solve(ABSOLUTE, work[ACC])
+    s, c = sines(tuple(y[:5]))
+    packed = WalkerModel(robot=robot).packed()
+    found = free_motion(packed, s, c, tuple(y[5:]), tuple(np.asarray(torques, dtype=np.float64)))
+    return np.linalg.solve(ABSOLUTE, np.array(found))
 
 
 def energy(state: np.ndarray, robot: Robot) -> tuple[float, float]:

@@ -1,0 +1,85 @@
+"""What the kernels keep in memory: an array of shape (ROWS, SIZE, LANES), a swing a lane.
+
+A row is a state, or its derivative: five absolute angles (rad), five rates (rad/s), and the work of
+each joint since the last step of the integrator (J). Some rows hold other numbers, named below.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.lanes import LANES
+
+SIZE = 14
+STATES = 10
+"""Angles and rates, without the works."""
+WORK = 10
+"""Column of the first joint's work."""
+
+(
+    Y,  # where the step of the integrator starts
+    Y_NEW,  # where it ends
+    SPARE,
+    MODE,  # columns below
+    COMMAND,  # what a controller commands: alpha (5), beta (5)
+    END,  # where the step ends, columns below
+    ESTIMATE,  # of the error, and what else was seen in the stages, columns below
+    FEET,  # swing foot within the step: x, y (m), dx, dy (m/s) at up to three places
+) = range(8)
+LOBE = 8
+"""Row of the first of four joints: up to four fractions of the step where the joint's power changes
+its sign, 2 for none, then its work up to each of them (J)."""
+STAGE = LOBE + 4
+"""Row of the derivative at the start of a step; those of the integrator's stages follow."""
+DENSE = STAGE + 16
+"""Row of the first of seven coefficients of the dense output."""
+ROWS = DENSE + 7
+
+# Columns of MODE: signs of the torques cut off (4), whether the controller has switched (0 or 1),
+# length of the step (s).
+CUT, SWITCHED, H = 0, 4, 5
+# Columns of END: sines (5) and cosines (5) of the angles, and torques that the controller wants.
+SINES, COSINES, WANTED = 0, 5, 10
+# Columns of ESTIMATE: error of order 5 and of order 3, least and greatest margin against slipping
+# and least normal force over the stages (N), how far a torque is beyond its limit, at most (N m),
+# and force at the end of the step.
+ERROR_5, ERROR_3, LEAST, MOST, LEAST_NORMAL, BEYOND, TANGENTIAL, NORMAL = range(8)
+
+
+@kernel
+def empty_scratch():
+    """Scratch of a kernel, zeros."""
+    return np.zeros((ROWS, SIZE, LANES))
+
+
+# Rows of a swing's variables, of shape (VARIABLES, LANES).
+(
+    TIME,  # s since the impact
+    ENERGY,  # J, at the start of the integrator's step
+    SINCE,  # s, when the present slip of the stance foot began; -1: it does not slip
+    MARGIN,  # N, against slipping, at the start of the step
+    FOOT_X,  # swing foot at the start of the step: m, m, m/s, m/s
+    FOOT_Y,
+    FOOT_DX,
+    FOOT_DY,
+    BACK_SIN,  # of the slope behind
+    BACK_COS,
+    LOWEST,  # m, above the slope behind: below it the foot scuffs
+    PASSED,  # 1 as soon as the swing foot has passed the stance foot
+    TODO,  # slopes not yet decided: 0 .. TODO - 1
+    STEPS,  # of the integrator
+    EVALUATIONS,
+    SAMPLES,  # in the trace
+    FAILURE,  # outcome of the slopes not yet decided, once known; -1 before
+    ACCEPTED,  # 1 if the step just tried is good
+    CHANGES,  # 1 if the set of torques cut off changes in it
+    SWITCHES,  # 1 if the controller switches in it
+    SLIPS,  # 1 if the stance foot may slip or lift in it
+    NEAR,  # 1 if the swing foot may meet the ground in it
+    END_X,  # swing foot at the end of the step
+    END_Y,
+    END_DX,
+    END_DY,
+) = range(26)
+VARIABLES = 26

@@ -1,0 +1,716 @@
+"""Swings, as many at once as there are lanes: from an impact to the outcome on every slope.
+
+A driver puts a swing into a lane with `begin`, and calls `advance` until the lane's swing has
+ended; `advance` takes one step of the integrator in all lanes. What a lane does depends on that
+lane alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+from biped_mfpt_ros.gait.closed_loop import beyond, margin, motion, powers, switch, which_cut
+from biped_mfpt_ros.gait.events import (
+    CUT_RESOLUTION,
+    body_root,
+    body_touches,
+    cubic_root,
+    first_below,
+    first_change,
+    foot_at,
+    foot_root,
+    may_dip,
+    motion_at,
+    slip_root,
+    switch_root,
+)
+from biped_mfpt_ros.gait.integrate import (
+    DENSE_STAGES,
+    STAGES,
+    estimated_error,
+    interpolate,
+    prepare_dense,
+    state_at,
+    trial_step,
+)
+from biped_mfpt_ros.gait.scratch import (
+    ACCEPTED,
+    BACK_COS,
+    BACK_SIN,
+    BEYOND,
+    CHANGES,
+    COSINES,
+    CUT,
+    END,
+    END_DX,
+    END_DY,
+    END_X,
+    END_Y,
+    ENERGY,
+    ESTIMATE,
+    EVALUATIONS,
+    FAILURE,
+    FEET,
+    FOOT_DX,
+    FOOT_DY,
+    FOOT_X,
+    FOOT_Y,
+    LEAST,
+    LEAST_NORMAL,
+    LOBE,
+    LOWEST,
+    MARGIN,
+    MODE,
+    MOST,
+    NEAR,
+    NORMAL,
+    PASSED,
+    SAMPLES,
+    SINCE,
+    SINES,
+    SIZE,
+    SLIPS,
+    STAGE,
+    STATES,
+    STEPS,
+    SWITCHED,
+    SWITCHES,
+    TANGENTIAL,
+    TIME,
+    TODO,
+    WORK,
+    Y_NEW,
+    H,
+    Y,
+)
+from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.lanes import LANES
+from biped_mfpt_ros.walker import impact
+from biped_mfpt_ros.walker import robot as r
+from biped_mfpt_ros.walker.dynamics import foot, sine_cosine, sines
+from biped_mfpt_ros.walker.outcome import Outcome
+
+FOOT_TOLERANCE = 1e-3
+"""m, how far below the ground behind a swing foot may start: states are typed in rounded."""
+
+_CLEARANCE = 1e-9  # m, rounding of the height of a foot that stands on the ground
+_MOST_STEPS = 20_000  # integrator steps before a swing is given up
+_MOST_EVALUATIONS = 500_000  # the same for evaluations: a swing may crawl without a step accepted
+_SLIP_INTERVAL = 0.004  # s between samples of a step that may contain a slip
+_FOOT_INTERVAL = 0.02  # s: the foot moves one way at most within it, and back
+_MOST_PARTS = 4
+_LONGEST_STEP = _MOST_PARTS * _FOOT_INTERVAL
+_SHORTEST_STEP = 1e-9  # s, up to an event
+_TRACE_SAMPLES = 8  # of every integrator step
+SAMPLE_COLUMNS = 18  # of a trace: t, a (5), da (5), u (4), tangential, normal force, energy
+
+_STEP = int(Outcome.STEP)
+_LIFTS = int(Outcome.STANCE_LIFTS)
+_SLIPS = int(Outcome.STANCE_SLIPS)
+_SCUFFS = int(Outcome.SWING_SCUFFS)
+_BEHIND = int(Outcome.FOOT_BEHIND)
+_PULLS = int(Outcome.IMPACT_PULLS)
+_IMPACT_SLIPS = int(Outcome.IMPACT_SLIPS)
+_NO_LIFT = int(Outcome.NO_LIFT_OFF)
+_BODY = int(Outcome.BODY_TOUCHES)
+_TIME = int(Outcome.TIME_LIMIT)
+_NOT_FINITE = int(Outcome.NOT_FINITE)
+_OPEN = 255  # not yet decided
+_N1, _N2, _N3 = 1.0 / 3.0, 0.6, 6.0 / 7.0  # when the integrator's stages 5, 9 and 10 are
+_NODES = (0.0, _N1, _N2, _N3, 1.0)
+
+
+@kernel
+def _unloaded(rob):
+    """N: a foot that slips under no load to speak of is one that lifts."""
+    return 1e-6 * rob[r.MASS] * rob[r.GRAVITY]
+
+
+@kernel
+def _root(error):
+    """By which a step of order 8 changes the error: its eighth root, the same on every machine."""
+    return math.sqrt(math.sqrt(math.sqrt(error)))
+
+
+@kernel
+def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, results):
+    """Put a swing into a lane.
+
+    Parameters
+    ----------
+    scheme : int
+        Code of the control scheme.
+    rob, par : numpy.ndarray
+        Packed model and controller.
+    w, v : numpy.ndarray
+        Scratch and variables of all lanes.
+    lane : int
+        Which.
+    state : numpy.ndarray
+        ``[q, dq]`` just after impact, rad and rad/s, shape (10,).
+    previous : float
+        rad, slope of the ground behind the stance foot.
+    slopes : numpy.ndarray
+        Sine and cosine of the slopes ahead, ascending, shape (m, 2).
+    outcomes, results : numpy.ndarray
+        Of the lane: codes, shape (m,), and durations (s), lengths (m), energies (J), shape (3, m).
+    """
+    m = outcomes.size
+    for i in range(m):
+        outcomes[i] = _OPEN
+        results[0, i] = 0.0
+        results[1, i] = 0.0
+        results[2, i] = 0.0
+    for o in (0, 5):
+        torso = state[o + 4]
+        w[Y, o, lane] = state[o] + torso
+        w[Y, o + 1, lane] = state[o + 1] + torso
+        w[Y, o + 2, lane] = w[Y, o, lane] + state[o + 2]
+        w[Y, o + 3, lane] = w[Y, o + 1, lane] + state[o + 3]
+        w[Y, o + 4, lane] = torso
+    for i in range(4):
+        w[Y, WORK + i, lane] = 0.0
+    v[TIME, lane] = 0.0
+    v[ENERGY, lane] = 0.0
+    v[SINCE, lane] = -1.0
+    v[PASSED, lane] = 0.0
+    v[TODO, lane] = m
+    v[STEPS, lane] = 0.0
+    v[EVALUATIONS, lane] = 0.0
+    v[SAMPLES, lane] = 0.0
+    v[FAILURE, lane] = -1.0
+    v[BACK_SIN, lane], v[BACK_COS, lane] = sine_cosine(previous)
+    w[MODE, H, lane] = 0.02 * _root(rob[r.TOLERANCE] / 1e-9)
+    w[MODE, SWITCHED, lane] = 0.0 if switch(scheme, par, w[Y, 0:5, lane]) > 0.0 else 1.0
+    s, c, force = _restart(scheme, rob, par, w, v, lane, True)
+    da = _rates(w, Y, lane)
+    x, y, dx, dy = foot(rob, s, c, da)
+    v[FOOT_X, lane], v[FOOT_Y, lane], v[FOOT_DX, lane], v[FOOT_DY, lane] = x, y, dx, dy
+    height = y * v[BACK_COS, lane] - x * v[BACK_SIN, lane]
+    v[LOWEST, lane] = min(height, 0.0) - _CLEARANCE
+    for i in range(STATES):
+        if not (math.isfinite(w[Y, i, lane]) and math.isfinite(w[STAGE, i, lane])):
+            v[FAILURE, lane] = _NOT_FINITE
+            return
+    if not (x < 0.0 and height >= -FOOT_TOLERANCE):
+        v[FAILURE, lane] = _SCUFFS
+        return
+    if not force[1] > _unloaded(rob):
+        v[FAILURE, lane] = _LIFTS
+        return
+    if not v[MARGIN, lane] > 0.0:
+        v[SINCE, lane] = 0.0
+        if rob[r.SLIP_DURATION] == 0.0:
+            v[FAILURE, lane] = _SLIPS
+            return
+    back = (v[BACK_SIN, lane], v[BACK_COS, lane])
+    todo = m
+    while todo > 0 and body_touches(rob, s, c, back, (slopes[todo - 1, 0], slopes[todo - 1, 1])):
+        todo -= 1
+        outcomes[todo] = _BODY
+    v[TODO, lane] = todo
+
+
+@kernel
+def _angles(w, row, lane):
+    return (w[row, 0, lane], w[row, 1, lane], w[row, 2, lane], w[row, 3, lane], w[row, 4, lane])
+
+
+@kernel
+def _rates(w, row, lane):
+    return (w[row, 5, lane], w[row, 6, lane], w[row, 7, lane], w[row, 8, lane], w[row, 9, lane])
+
+
+@kernel
+def _cut(w, lane):
+    return (
+        w[MODE, CUT, lane],
+        w[MODE, CUT + 1, lane],
+        w[MODE, CUT + 2, lane],
+        w[MODE, CUT + 3, lane],
+    )
+
+
+@kernel
+def _restart(scheme, rob, par, w, v, lane, afresh):
+    """Evaluate the closed loop at row Y, for the next step; ``afresh``: find what is cut off.
+
+    Returns sines and cosines of the angles, and the force on the stance foot.
+    """
+    a, da = _angles(w, Y, lane), _rates(w, Y, lane)
+    switched = w[MODE, SWITCHED, lane]
+    if afresh:
+        for i in range(4):
+            w[MODE, CUT + i, lane] = 0.0
+    dda, wanted, applied, force, s, c = motion(scheme, rob, par, _cut(w, lane), switched, a, da)
+    v[EVALUATIONS, lane] += 1
+    if afresh and beyond(rob, _cut(w, lane), wanted) > 0.0:
+        cut = which_cut(rob, wanted)
+        for i in range(4):
+            w[MODE, CUT + i, lane] = cut[i]
+        dda, wanted, applied, force, s, c = motion(scheme, rob, par, cut, switched, a, da)
+        v[EVALUATIONS, lane] += 1
+    power = powers(applied, da)
+    for i in range(5):
+        w[STAGE, i, lane] = da[i]
+        w[STAGE, 5 + i, lane] = dda[i]
+    for i in range(4):
+        w[STAGE, WORK + i, lane] = power[i]
+    v[MARGIN, lane] = margin(rob, force)
+    return s, c, force
+
+
+@kernel
+def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, trace):
+    """One step of the integrator in all lanes, and what happens in it.
+
+    Parameters
+    ----------
+    scheme : int
+        Code of the control scheme.
+    rob, par, w, v : numpy.ndarray
+        As for `begin`.
+    active : numpy.ndarray
+        Which lanes hold a swing that has not ended, bool, shape (LANES,); updated.
+    slopes, outcomes, results : numpy.ndarray
+        As for `begin`, for each lane: shape (LANES, m, 2), (LANES, m), (LANES, 3, m).
+    after : numpy.ndarray
+        States after impact (absolute angles) where the outcome is STEP, shape (LANES, m, 10).
+    trace : numpy.ndarray
+        Samples of the swing in lane 0, shape (k, SAMPLE_COLUMNS); k = 0: none are wanted.
+    """
+    for lane in range(LANES):
+        if active[lane]:
+            _propose(rob, w, v, lane)
+            if v[FAILURE, lane] >= 0.0 or v[TODO, lane] == 0.0:
+                _end(v, lane, outcomes[lane], results[lane])
+                active[lane] = False
+    if not active.any():
+        return
+    trial_step(scheme, rob, par, w)
+    dense = False
+    for lane in range(LANES):
+        if active[lane]:
+            v[EVALUATIONS, lane] += STAGES
+            if _inspect(scheme, rob, par, w, v, lane, slopes[lane]) or trace.shape[0] > 0:
+                v[EVALUATIONS, lane] += DENSE_STAGES
+                dense = True
+    if dense:
+        prepare_dense(scheme, rob, par, w)
+    for lane in range(LANES):
+        if active[lane] and v[ACCEPTED, lane] != 0.0:
+            _finish(
+                scheme,
+                rob,
+                par,
+                w,
+                v,
+                lane,
+                slopes[lane],
+                outcomes[lane],
+                results[lane],
+                after[lane],
+                trace,
+            )
+
+
+@kernel
+def _propose(rob, w, v, lane):
+    """Limit the length of the next step, or end the swing."""
+    left = rob[r.TIME_LIMIT] - v[TIME, lane]
+    if v[FAILURE, lane] < 0.0 and v[TODO, lane] > 0.0:
+        crawls = v[STEPS, lane] >= _MOST_STEPS or v[EVALUATIONS, lane] >= _MOST_EVALUATIONS
+        if crawls or left <= 0.0:
+            v[FAILURE, lane] = _TIME
+        w[MODE, H, lane] = min(w[MODE, H, lane], _LONGEST_STEP, left + 1e-9)
+
+
+@kernel
+def _end(v, lane, outcomes, results):
+    """The slopes that are still open share the failure that ended the swing."""
+    for i in range(int(v[TODO, lane])):
+        outcomes[i] = int(v[FAILURE, lane])
+        results[0, i] = v[TIME, lane]
+        results[2, i] = v[ENERGY, lane]
+
+
+@kernel
+def _inspect(scheme, rob, par, w, v, lane, slopes):
+    """Whether the step just tried is good, and whether something may happen in it.
+
+    Returns whether its dense output is needed to find out.
+    """
+    error = estimated_error(w, lane)
+    h = w[MODE, H, lane]
+    if not error <= 1.0:
+        v[ACCEPTED, lane] = 0.0
+        if h < 1e-13 or (not math.isfinite(error) and h < 1e-9):
+            v[FAILURE, lane] = _NOT_FINITE
+        w[MODE, H, lane] = h * (max(0.2, 0.9 / _root(error)) if math.isfinite(error) else 0.1)
+        return False
+    v[ACCEPTED, lane] = 1.0
+    v[STEPS, lane] += 1.0
+    changes = w[ESTIMATE, BEYOND, lane] > CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
+    switched = w[MODE, SWITCHED, lane] > 0.5
+    switches = (switch(scheme, par, w[Y_NEW, 0:5, lane]) > 0.0) == switched
+    least = min(w[ESTIMATE, LEAST, lane], v[MARGIN, lane])
+    most = max(w[ESTIMATE, MOST, lane], v[MARGIN, lane])
+    uncertain = 0.25 * (most - least) + 1e-3 * rob[r.MASS] * rob[r.GRAVITY]
+    slips = not (
+        least > uncertain and w[ESTIMATE, LEAST_NORMAL, lane] > uncertain and v[SINCE, lane] < 0.0
+    )
+    s = (w[END, 0, lane], w[END, 1, lane], w[END, 2, lane], w[END, 3, lane], w[END, 4, lane])
+    c = (w[END, 5, lane], w[END, 6, lane], w[END, 7, lane], w[END, 8, lane], w[END, 9, lane])
+    x, y, dx, dy = foot(rob, s, c, _rates(w, Y_NEW, lane))
+    v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane] = x, y, dx, dy
+    i = int(v[TODO, lane]) - 1
+    slope = (slopes[i, 0], slopes[i, 1])
+    back = (v[BACK_SIN, lane], v[BACK_COS, lane])
+    near = body_touches(rob, s, c, back, slope)
+    if v[FOOT_X, lane] < 0.0:
+        near = near or x >= 0.0 or _may_reach(v, lane, -back[0], back[1], h)
+    else:
+        near = near or x < 0.0 or _may_reach(v, lane, -slope[0], slope[1], h)
+    v[CHANGES, lane] = 1.0 if changes else 0.0
+    v[SWITCHES, lane] = 1.0 if switches else 0.0
+    v[SLIPS, lane] = 1.0 if slips else 0.0
+    v[NEAR, lane] = 1.0 if near else 0.0
+    return changes or switches or slips or near
+
+
+@kernel
+def _may_reach(v, lane, nx, ny, h):
+    """Whether the swing foot may come down to ``nx x + ny y = 0`` in the step."""
+    f0 = nx * v[FOOT_X, lane] + ny * v[FOOT_Y, lane]
+    d0 = (nx * v[FOOT_DX, lane] + ny * v[FOOT_DY, lane]) * h
+    f1 = nx * v[END_X, lane] + ny * v[END_Y, lane]
+    d1 = (nx * v[END_DX, lane] + ny * v[END_DY, lane]) * h
+    return may_dip(f0, d0, f1, d1)
+
+
+@kernel
+def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trace):
+    """What happens in a step that is good, and the start of the next one."""
+    h, t = w[MODE, H, lane], v[TIME, lane]
+    _find_lobes(w, lane)
+
+    # The step ends early where a torque reaches or leaves its limit, or the controller switches.
+    end, joint, held, switches = 1.0, -1, 0.0, False
+    if v[CHANGES, lane] != 0.0:
+        at, joint, held, evaluations = first_change(scheme, rob, par, w, lane, h)
+        v[EVALUATIONS, lane] += evaluations
+        if joint >= 0:
+            end = min(1.0, max(at, _SHORTEST_STEP / h))
+    if v[SWITCHES, lane] != 0.0:
+        at = switch_root(scheme, par, w, lane, w[MODE, SWITCHED, lane] > 0.5, h)
+        if at <= end:
+            end, joint, switches = at, -1, True
+    if end < 1.0:
+        _cut_short(rob, w, v, lane, end)
+
+    stop, failure = end, -1
+    if v[SLIPS, lane] != 0.0:
+        stop, failure = _first_fall(scheme, rob, par, w, v, lane, end, h)
+    if v[NEAR, lane] != 0.0:
+        stop, failure = _ground(
+            rob, w, v, lane, slopes, outcomes, results, after, end, stop, failure
+        )
+    if trace.shape[0] > 0 and lane == 0:
+        until = stop
+        if v[TODO, lane] == 0.0:
+            until = min(stop, (results[0, 0] - t) / h)
+        _sample(scheme, rob, par, w, v, trace, until)
+    if failure >= 0:
+        v[FAILURE, lane] = failure
+        v[ENERGY, lane] = _energy(w, v, lane, stop)
+        v[TIME, lane] = t + stop * h
+        return
+
+    v[ENERGY, lane] = _energy(w, v, lane, end)
+    v[TIME, lane] = t + end * h
+    v[FOOT_X, lane], v[FOOT_Y, lane] = v[END_X, lane], v[END_Y, lane]
+    v[FOOT_DX, lane], v[FOOT_DY, lane] = v[END_DX, lane], v[END_DY, lane]
+    for i in range(STATES):
+        w[Y, i, lane] = w[Y_NEW, i, lane]
+    error = estimated_error(w, lane)
+    w[MODE, H, lane] = h * (5.0 if error < 1e-6 else min(5.0, 0.9 / _root(error)))
+    if joint >= 0:
+        w[MODE, CUT + joint, lane] = held
+    if switches:
+        w[MODE, SWITCHED, lane] = 1.0 - w[MODE, SWITCHED, lane]
+        w[MODE, H, lane] = min(w[MODE, H, lane], 0.25 * h)
+    if joint >= 0 or switches:
+        _, _, force = _restart(scheme, rob, par, w, v, lane, switches)
+        if switches and v[SINCE, lane] < 0.0 and not v[MARGIN, lane] > 0.0:
+            v[SINCE, lane] = v[TIME, lane]
+            if rob[r.SLIP_DURATION] == 0.0:
+                v[FAILURE, lane] = _SLIPS if force[1] > _unloaded(rob) else _LIFTS
+    else:
+        for i in range(SIZE):
+            w[STAGE, i, lane] = w[STAGE + STAGES, i, lane]
+        v[MARGIN, lane] = margin(rob, (w[ESTIMATE, TANGENTIAL, lane], w[ESTIMATE, NORMAL, lane]))
+
+
+@kernel
+def _cut_short(rob, w, v, lane, end):
+    """End the step at a fraction of it."""
+    for i in range(SIZE):
+        w[Y_NEW, i, lane] = interpolate(w, lane, i, end)
+    s, c = sines(_angles(w, Y_NEW, lane))
+    for i in range(5):
+        w[END, SINES + i, lane] = s[i]
+        w[END, COSINES + i, lane] = c[i]
+    x, y, dx, dy = foot(rob, s, c, _rates(w, Y_NEW, lane))
+    v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane] = x, y, dx, dy
+
+
+@kernel
+def _first_fall(scheme, rob, par, w, v, lane, end, h):
+    """When the stance foot has slipped long enough, or lifts: a fraction of the step, an outcome.
+
+    The end of the step and -1 if it does neither.
+    """
+    t, since = v[TIME, lane], v[SINCE, lane]
+    last, last_value = 0.0, v[MARGIN, lane]
+    slipping = since >= 0.0
+    samples = 2 + int(end * h / _SLIP_INTERVAL)
+    for k in range(1, samples + 1):
+        at = end * k / samples
+        _, _, force = motion_at(scheme, rob, par, w, lane, at)
+        v[EVALUATIONS, lane] += 1
+        value = margin(rob, force)
+        slips = not value > 0.0
+        began, until = since, t + at * h
+        if slips != slipping:
+            root = slip_root(scheme, rob, par, w, lane, last, last_value, at, value, h)
+            if slips:
+                since = t + root * h
+                began = since
+            else:
+                until = t + root * h
+                since = -1.0
+        if (slips or slipping) and began + rob[r.SLIP_DURATION] <= until:
+            stop = min(end, max(0.0, (began + rob[r.SLIP_DURATION] - t) / h))
+            _, _, force = motion_at(scheme, rob, par, w, lane, stop)
+            v[SINCE, lane] = since
+            return stop, (_SLIPS if force[1] > _unloaded(rob) else _LIFTS)
+        if not force[1] > 0.0:
+            v[SINCE, lane] = since
+            return at, _LIFTS
+        slipping, last, last_value = slips, at, value
+    v[SINCE, lane] = since
+    return end, -1
+
+
+@kernel
+def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failure):
+    """Where the swing foot and the body meet the ground before ``stop``.
+
+    Decides the slopes that are reached, and returns where the step stops and the outcome of all
+    others, which is ``failure`` if the foot does not come down behind.
+    """
+    h = w[MODE, H, lane]
+    parts = min(_MOST_PARTS, int(h / _FOOT_INTERVAL) + 1)
+    for k in range(1, parts):
+        x, y, dx, dy = foot_at(rob, w, lane, k / parts)
+        w[FEET, 4 * k - 4, lane], w[FEET, 4 * k - 3, lane] = x, y
+        w[FEET, 4 * k - 2, lane], w[FEET, 4 * k - 1, lane] = dx, dy
+    at_start = (v[FOOT_X, lane], v[FOOT_Y, lane], v[FOOT_DX, lane], v[FOOT_DY, lane])
+    at_end = (v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane])
+    back = (v[BACK_SIN, lane], v[BACK_COS, lane])
+    low, at_low = 0.0, at_start  # the foot is ahead of the stance foot from low to high
+    high = end
+    if at_start[0] < 0.0:
+        low, at_low = end, at_end
+        if at_end[0] >= 0.0:
+            low = _passing(rob, w, lane, -1.0, at_start, at_end, end, h)
+            at_low = foot_at(rob, w, lane, low)
+        # Behind the stance foot: against the ground of the preceding slope.
+        touch = first_below(
+            rob, w, lane, -back[0], back[1], v[LOWEST, lane], 0.0, at_start, low, at_low, parts, h
+        )
+        if touch > 1.0 and at_end[0] >= 0.0 and not at_low[1] > 0.0:
+            touch = low
+        if touch <= stop:
+            stop = touch
+            failure = _BEHIND if v[PASSED, lane] != 0.0 else _SCUFFS
+        if at_end[0] >= 0.0:
+            v[PASSED, lane] = 1.0
+    elif at_end[0] < 0.0:
+        high = _passing(rob, w, lane, 1.0, at_start, at_end, end, h)
+    high = min(stop, high)
+    at_high = at_end if high == end else foot_at(rob, w, lane, high)
+
+    # Slopes that the foot or the body reaches in this step, the steepest first. Each is decided by
+    # itself, so that its outcome does not depend on the others.
+    todo = int(v[TODO, lane])
+    while todo > 0:
+        slope = (slopes[todo - 1, 0], slopes[todo - 1, 1])
+        landing = 2.0
+        if high > low:
+            landing = first_below(
+                rob, w, lane, -slope[0], slope[1], 0.0, low, at_low, high, at_high, parts, h
+            )
+        until = min(stop, landing)
+        a, da = _angles(w, Y_NEW, lane), _rates(w, Y_NEW, lane)
+        if until < end:
+            a, da = state_at(w, lane, until)
+        s, c = sines(a)
+        touch = 2.0
+        if body_touches(rob, s, c, back, slope):
+            touch = body_root(rob, w, lane, back, slope, until)
+        if landing > 1.0 and touch > 1.0:
+            break
+        todo -= 1
+        if touch < landing:
+            outcomes[todo] = _BODY
+        else:
+            touch = landing
+            outcomes[todo] = _land(rob, s, c, a, da, slope, after[todo])
+            if outcomes[todo] == _STEP:
+                x, y, _, _ = foot(rob, s, c, da)
+                results[1, todo] = math.sqrt(x * x + y * y)
+        results[0, todo] = v[TIME, lane] + touch * h
+        results[2, todo] = _energy(w, v, lane, touch)
+    v[TODO, lane] = todo
+    return stop, failure
+
+
+@kernel
+def _passing(rob, w, lane, side, at_start, at_end, end, h):
+    """When the swing foot passes the stance foot, from ``side`` of it (1: from ahead)."""
+    guess = end * cubic_root(
+        side * at_start[0],
+        side * at_start[2] * end * h,
+        side * at_end[0],
+        side * at_end[2] * end * h,
+    )
+    return foot_root(rob, w, lane, side, 0.0, 0.0, 0.0, end, guess, h)
+
+
+@kernel
+def _land(rob, s, c, a, da, slope, after):
+    """Impact on a slope. Returns the outcome and sets ``after``, in absolute angles."""
+    sine, cosine = slope
+    rates, px, py, vx, vy = impact.impact(rob, s, c, da)
+    new = impact.swapped(a)
+    for i in range(5):
+        after[i] = new[i]
+        after[5 + i] = rates[i]
+    normal = py * cosine - px * sine
+    tangential = px * cosine + py * sine
+    for i in range(10):
+        if not math.isfinite(after[i]):
+            return _NOT_FINITE
+    if not normal > 0.0:
+        return _PULLS
+    if rob[r.VERTICAL_FRICTION] != 0.0:
+        sticks = abs(px) < rob[r.FRICTION] * py
+    else:
+        sticks = abs(tangential) < rob[r.FRICTION] * normal
+    if not sticks:
+        return _IMPACT_SLIPS
+    if not vy * cosine - vx * sine > 0.0:
+        return _NO_LIFT
+    return _STEP
+
+
+@kernel
+def to_joint(absolute, state):
+    """Absolute angles and rates as a state ``[q, dq]``."""
+    for o in (0, 5):
+        torso = absolute[o + 4]
+        state[o] = absolute[o] - torso
+        state[o + 1] = absolute[o + 1] - torso
+        state[o + 2] = absolute[o + 2] - absolute[o]
+        state[o + 3] = absolute[o + 3] - absolute[o + 1]
+        state[o + 4] = torso
+
+
+@kernel
+def _find_lobes(w, lane):
+    """Find where the power of a joint changes its sign, and the joint's work up to there.
+
+    The energy is the integral of the power's magnitude, which has a kink there. The powers at five
+    stages give a polynomial; it is needed up to the kinks only, where its error matters little.
+    """
+    h = w[MODE, H, lane]
+    for i in range(4):
+        row = LOBE + i
+        for k in range(4):
+            w[row, k, lane] = 2.0
+        column = WORK + i
+        p0, p1, p2 = w[STAGE, column, lane], w[STAGE + 5, column, lane], w[STAGE + 9, column, lane]
+        p3, p4 = w[STAGE + 10, column, lane], w[STAGE + STAGES, column, lane]
+        if min(min(p0, p1), min(p2, min(p3, p4))) * max(max(p0, p1), max(p2, max(p3, p4))) < 0.0:
+            # Newton's divided differences on the nodes, then powers of the fraction.
+            d1 = (p1 - p0) / _N1
+            e2 = (p2 - p1) / (_N2 - _N1)
+            e3 = (p3 - p2) / (_N3 - _N2)
+            e4 = (p4 - p3) / (1.0 - _N3)
+            d2 = (e2 - d1) / _N2
+            f3 = (e3 - e2) / (_N3 - _N1)
+            f4 = (e4 - e3) / (1.0 - _N2)
+            d3 = (f3 - d2) / _N3
+            d4 = (f4 - f3) / (1.0 - _N1) - d3
+            b3 = d3 - d4 * (_N1 + _N2 + _N3)
+            b2 = d2 - d3 * (_N1 + _N2) + d4 * (_N1 * _N2 + _N1 * _N3 + _N2 * _N3)
+            b1 = d1 - d2 * _N1 + d3 * _N1 * _N2 - d4 * _N1 * _N2 * _N3
+            found = 0
+            for k in range(4):
+                low, before = _NODES[k], (p0, p1, p2, p3)[k]
+                high, after = _NODES[k + 1], (p1, p2, p3, p4)[k]
+                if before * after < 0.0:
+                    at = low + (high - low) * before / (before - after)
+                    for _ in range(4):
+                        value = p0 + at * (b1 + at * (b2 + at * (b3 + at * d4)))
+                        if (value > 0.0) == (before > 0.0):
+                            low = at
+                        else:
+                            high = at
+                        slope = b1 + at * (2.0 * b2 + at * (3.0 * b3 + at * 4.0 * d4))
+                        at -= value / slope
+                        if not low < at < high:
+                            at = 0.5 * (low + high)
+                    work = p0 + at * (b1 / 2.0 + at * (b2 / 3.0 + at * (b3 / 4.0 + at * d4 / 5.0)))
+                    w[row, found, lane] = at
+                    w[row, 4 + found, lane] = h * at * work
+                    found += 1
+
+
+@kernel
+def _energy(w, v, lane, at):
+    """Energy spent up to a fraction of the step, J (eq. 36)."""
+    total = v[ENERGY, lane]
+    for i in range(4):
+        work = w[Y_NEW, WORK + i, lane] if at >= 1.0 else interpolate(w, lane, WORK + i, at)
+        last = 0.0
+        for k in range(4):
+            if w[LOBE + i, k, lane] >= at:
+                break
+            total += abs(w[LOBE + i, 4 + k, lane] - last)
+            last = w[LOBE + i, 4 + k, lane]
+        total += abs(work - last)
+    return total
+
+
+@kernel
+def _sample(scheme, rob, par, w, v, trace, until):
+    """Samples of lane 0 up to a fraction of the step, into the trace."""
+    samples = int(v[SAMPLES, 0])
+    first = 0 if samples == 0 else 1
+    for k in range(first, _TRACE_SAMPLES + 1):
+        if samples < trace.shape[0]:
+            at = until * k / _TRACE_SAMPLES
+            a, da = state_at(w, 0, at)
+            _, applied, force = motion_at(scheme, rob, par, w, 0, at)
+            trace[samples, 0] = v[TIME, 0] + at * w[MODE, H, 0]
+            for i in range(5):
+                trace[samples, 1 + i] = a[i]
+                trace[samples, 6 + i] = da[i]
+            for i in range(4):
+                trace[samples, 11 + i] = applied[i]
+            trace[samples, 15], trace[samples, 16] = force
+            trace[samples, 17] = _energy(w, v, 0, at)
+            samples += 1
+    v[SAMPLES, 0] = samples

@@ -1,0 +1,201 @@
+"""Several swings at once: numbers of `LANES` lanes, as one vector register holds them.
+
+A kernel written for numbers also takes `Lanes`: they add, subtract, multiply, divide, compare and
+`select` lane by lane, each exactly as the number alone would, so that a lane's result depends
+neither on the others nor on the instructions that a machine has. What cannot be written so (a
+branch, a table) is done lane by lane on memory.
+
+Numba has no such type; this module adds it by numba's extension interface.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, overload, register_model
+
+LANES = 4
+"""Swings that are simulated at once: doubles in a register of AVX2."""
+
+_VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+_FLAGS = ir.VectorType(ir.IntType(1), LANES)
+
+
+class _LanesType(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+class _MaskType(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="LanesMask")
+
+
+_lanes, _mask = _LanesType(), _MaskType()
+
+
+@register_model(_LanesType)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, numba_type: types.Type) -> None:
+        super().__init__(manager, numba_type, _VECTOR)
+
+
+@register_model(_MaskType)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, numba_type: types.Type) -> None:
+        super().__init__(manager, numba_type, _FLAGS)
+
+
+def _vector(context: Any, builder: Any, value: Any, numba_type: types.Type) -> Any:
+    """A number in every lane; lanes as they are."""
+    if isinstance(numba_type, _LanesType):
+        return value
+    number = context.cast(builder, value, numba_type, types.float64)
+    out = ir.Constant(_VECTOR, ir.Undefined)
+    for lane in range(LANES):
+        out = builder.insert_element(out, number, ir.Constant(ir.IntType(32), lane))
+    return out
+
+
+def _define(operation: Any, result: types.Type, kind: type, emit: Callable) -> None:
+    """Teach numba a binary operation on lanes and numbers (or masks)."""
+    allowed = (kind, types.Float, types.Integer) if kind is _LanesType else (kind,)
+
+    @infer_global(operation)
+    class Template(AbstractTemplate):
+        key = operation
+
+        def generic(self, args: tuple, kws: dict) -> Any:
+            known = len(args) == 2 and all(isinstance(a, allowed) for a in args)
+            if known and any(isinstance(a, kind) for a in args):
+                return signature(result, *args)
+            return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        if kind is _LanesType:
+            pairs = zip(args, sig.args, strict=True)
+            args = tuple(_vector(context, builder, value, own) for value, own in pairs)
+        return emit(builder, *args)
+
+    for other in allowed:
+        lower_builtin(operation, kind, other)(lower)
+        if other is not kind:
+            lower_builtin(operation, other, kind)(lower)
+
+
+for _operation, _method in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _define(_operation, _lanes, _LanesType, lambda b, x, y, m=_method: getattr(b, m)(x, y))
+for _operation, _sign in (
+    (operator.lt, "<"),
+    (operator.gt, ">"),
+    (operator.le, "<="),
+    (operator.ge, ">="),
+    (operator.eq, "=="),
+):
+    _define(_operation, _mask, _LanesType, lambda b, x, y, c=_sign: b.fcmp_ordered(c, x, y))
+_define(operator.ne, _mask, _LanesType, lambda b, x, y: b.fcmp_unordered("!=", x, y))
+_define(operator.and_, _mask, _MaskType, lambda b, x, y: b.and_(x, y))
+_define(operator.or_, _mask, _MaskType, lambda b, x, y: b.or_(x, y))
+
+
+@infer_global(operator.neg)
+class _Negative(AbstractTemplate):
+    key = operator.neg
+
+    def generic(self, args: tuple, kws: dict) -> Any:
+        return signature(_lanes, _lanes) if args == (_lanes,) else None
+
+
+lower_builtin(operator.neg, _LanesType)(lambda context, builder, sig, args: builder.fneg(args[0]))
+
+
+@intrinsic
+def _select(context, mask, x, y):  # type: ignore[no-untyped-def]
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        x, y = (_vector(context, builder, args[i], sig.args[i]) for i in (1, 2))
+        return builder.select(args[0], x, y)
+
+    return _lanes(mask, x, y), generate
+
+
+def select(condition: Any, x: Any, y: Any) -> Any:
+    """``x`` where the condition holds, else ``y``."""
+    return x if condition else y
+
+
+@overload(select)
+def _overload_select(condition, x, y):  # type: ignore[no-untyped-def]
+    if isinstance(condition, _MaskType):
+        return lambda condition, x, y: _select(condition, x, y)
+    return lambda condition, x, y: x if condition else y
+
+
+@intrinsic
+def _magnitude(context, x):  # type: ignore[no-untyped-def]
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fabs.v{LANES}f64")
+        return builder.call(function, args)
+
+    return _lanes(_lanes), generate
+
+
+@overload(abs)
+def _overload_abs(x):  # type: ignore[no-untyped-def]
+    if isinstance(x, _LanesType):
+        return lambda x: _magnitude(x)
+    return None
+
+
+def _pointer(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+    """Where the lanes of ``array[row, i]`` stand; the array is contiguous, (rows, k, LANES)."""
+    array = context.make_array(sig.args[0])(context, builder, args[0])
+    width = builder.extract_value(array.shape, 1)
+    row, i = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (1, 2))
+    place = builder.mul(builder.add(builder.mul(row, width), i), ir.Constant(width.type, LANES))
+    return builder.bitcast(builder.gep(array.data, [place]), _VECTOR.as_pointer())
+
+
+@intrinsic
+def load(context, array, row, i):  # type: ignore[no-untyped-def]
+    """Lanes ``array[row, i, :]`` of a contiguous array of shape (rows, k, LANES)."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        value = builder.load(_pointer(context, builder, sig, args))
+        value.align = 8
+        return value
+
+    return _lanes(array, row, i), generate
+
+
+@intrinsic
+def store(context, array, row, i, value):  # type: ignore[no-untyped-def]
+    """Put lanes, or one number, into ``array[row, i, :]``."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        lanes = _vector(context, builder, args[3], sig.args[3])
+        builder.store(lanes, _pointer(context, builder, sig, args)).align = 8
+        return context.get_dummy_value()
+
+    return types.void(array, row, i, value), generate
+
+
+@intrinsic
+def any_lane(context, mask):  # type: ignore[no-untyped-def]
+    """Whether a condition holds in any lane."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        bits = builder.bitcast(args[0], ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
+    return types.boolean(mask), generate
