@@ -475,6 +475,12 @@ def test_columns_that_settle_at_different_times_do_not_mix():
     for p, result in zip(columns, found, strict=True):
         assert_same_bits(result, solve_chain(targets, outcomes, p))
 
+    rows, slopes = walker(12, 0.8)
+    mesh = mesh_of(*lifted(rows, len(slopes), 1), slopes)
+    sigmas = np.radians(np.linspace(0.5, 5.0, 30))
+    for sigma, result in zip(sigmas, metastabilities(mesh, 0.0, sigmas), strict=True):
+        assert_same_bits(result, metastability(mesh, 0.0, sigma))
+
 
 def test_fall_back_of_one_column_leaves_the_others(monkeypatch):
     # At the second distribution the two gaits hardly ever change: not iterated.
@@ -689,6 +695,18 @@ def test_too_large_and_too_slow_is_a_clear_error(monkeypatch):
     monkeypatch.setattr(markov, "DENSE_LIMIT", 299)
     with pytest.raises(ChainError, match="300 states"):
         solve(birth_death(300, ends=(0, 0)), [0.5, 0.5])
+
+
+def test_an_unsolved_distribution_leaves_the_others(monkeypatch):
+    monkeypatch.setattr(markov, "DENSE_LIMIT", 1)
+    monkeypatch.setattr(markov, "_STEPS", 500)
+    targets = np.array([[0] * 4, [1, 0, 1, 2], [2, 2, 0, 2]], dtype=np.uint32)
+    outcomes = np.where(targets == 0, 9, 0).astype(np.uint8)
+    outcomes[0] = NOT_SIMULATED
+    columns = np.array([[1.0 - 3e-9, 1e-9, 1e-12, 2e-9], [0.4, 0.1, 0.2, 0.3]])
+    slow, found = markov._solve(targets, outcomes, np.ascontiguousarray(columns.T))
+    assert isinstance(slow, ChainError)
+    assert_same_bits(found, solve_chain(targets, outcomes, columns[1]))
 
 
 def test_one_mesh_serves_any_distribution():

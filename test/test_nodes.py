@@ -538,7 +538,7 @@ class Publisher(Node):
             )
         ]
 
-    def publish(self, mesh, mesh_id, lost=(), status=MeshInfo.COMPLETE):
+    def publish(self, mesh, mesh_id, lost=(), status=MeshInfo.COMPLETE, backwards=False):
         growing = MeshInfo(
             mesh_id=mesh_id, settings=messages.settings_message(settings()), states=1
         )
@@ -561,7 +561,8 @@ class Publisher(Node):
         for kind, topic in enumerate(([growing, closing], states, rows)):
             for sequence, message in enumerate(topic):
                 message.sequence = sequence
-                if (kind, sequence) not in lost:
+            for message in topic[:: -1 if backwards else 1]:
+                if (kind, message.sequence) not in lost:
                     self._topics[kind].publish(message)
 
 
@@ -588,7 +589,28 @@ def test_compute_mfpt(graph, tester, mesh_here):
             same_estimate(estimate, mesh_here, 0.01, sigma_s)
     forgotten = compute(ask("a"))
     assert not forgotten.success
-    assert "only the last 2 are kept" in forgotten.message
+    assert "only the last 2 meshes are kept" in forgotten.message
+
+
+def test_meshes_are_kept_by_number_of_states_too(graph, tester, mesh_here):
+    graph.start(Analysis, keep_states=2 * len(mesh_here.states))
+    publisher = graph.start(Publisher)
+    compute = tester.service(ComputeMfpt, "compute_mfpt")
+    for mesh_id in ("a", "b", "c"):
+        publisher.publish(mesh_here, mesh_id)
+    wait_for(lambda: compute(ask("c")).success, "the mesh")
+    assert compute(ask("b")).success
+    assert f"of at most {2 * len(mesh_here.states)} states" in compute(ask("a")).message
+
+
+def test_mesh_is_taken_in_whichever_order_its_messages_come(graph, tester, mesh_here):
+    # A late subscriber may get new messages before those that were kept for it.
+    graph.start(Analysis)
+    graph.start(Publisher).publish(mesh_here, "backwards", backwards=True)
+    compute = tester.service(ComputeMfpt, "compute_mfpt")
+    wait_for(lambda: compute(ask("backwards")).success, "the mesh")
+    (estimate,) = compute(ask("backwards")).estimates
+    same_estimate(estimate, mesh_here, 0.0, 0.02)
 
 
 @pytest.fixture(scope="class")
@@ -618,7 +640,7 @@ class TestBadQuestions:
             (ask("none"), ("mesh_id", "'none'", "a complete mesh: good")),
             (
                 ask("gap"),
-                ("mesh_id", "'gap'", "the next state was to have index 2, not "),
+                ("mesh_id", "'gap'", "mesh/states: from index 2 to before "),
             ),
             (ask("failed"), ("mesh_id", "'failed'", "it failed: because")),
             (ask("open"), ("mesh_id", "'open'", "it is not finished")),

@@ -28,6 +28,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from numbers import Real
 
 import numpy as np
@@ -363,8 +364,10 @@ class _Solver:
             self.structure, p, begin, weights, factors, TOLERANCE, _STEPS, on_steps
         )
 
-    def distributions(self, columns: np.ndarray, on_steps: iteration.OnSteps | None) -> np.ndarray:
-        """Metastable distributions of some columns, shape (n, columns).
+    def distributions(
+        self, columns: np.ndarray, on_steps: iteration.OnSteps | None
+    ) -> tuple[np.ndarray, dict[int, ChainError]]:
+        """Metastable distributions of some columns, shape (n, columns), and why some are 0.
 
         A state that is hardly ever visited again would not do to begin with: its first steps may
         share weight out between parts of the chain in a way that later steps are too slow to put
@@ -399,9 +402,14 @@ class _Solver:
             left = np.array(again, dtype=np.int64)
             if not len(left):
                 break
+        errors = {}
         for c in [*unsettled, *left]:
-            out[:, c] = self._squared(columns[c])
-        return out
+            try:
+                out[:, c] = self._squared(columns[c])
+            except ChainError as error:
+                out[:, c] = 0.0
+                errors[int(c)] = error
+        return out, errors
 
     def _aside(self, column: int, begin: int, phi: np.ndarray) -> np.ndarray | None:
         """States reached from x_2 but not from `begin`, if they may have a larger eigenvalue.
@@ -450,13 +458,18 @@ class _Solver:
         iteration.account(self.targets, self.outcomes, p, phi, by_code, survives)
         return by_code, survives
 
-    def solve(self, columns: np.ndarray, on_steps: iteration.OnSteps | None) -> list[Metastability]:
-        """Metastability of some columns."""
-        phi = self.distributions(columns, on_steps)
+    def solve(
+        self, columns: np.ndarray, on_steps: iteration.OnSteps | None
+    ) -> list[Metastability | ChainError]:
+        """Metastability of some columns, or why it is not known."""
+        phi, errors = self.distributions(columns, on_steps)
         by_code, survives = self._account(columns, phi)
-        out = []
+        out: list[Metastability | ChainError] = []
         for c, column in enumerate(columns):
-            falls = float(by_code[:, c].sum())
+            if c in errors:
+                out.append(errors[c])
+                continue
+            falls = math.fsum(by_code[:, c])
             total = float(survives[c]) + falls
             distribution = phi[:, c].copy()
             distribution.flags.writeable = False
@@ -483,29 +496,44 @@ def _solve(
     probabilities: np.ndarray,
     threads: int | None = None,
     on_progress: OnProgress | None = None,
-) -> list[Metastability]:
+) -> list[Metastability | ChainError]:
     """Metastability for each column of `probabilities`, shape (m, columns)."""
     solver = _Solver(targets, outcomes, probabilities)
     count = probabilities.shape[1]
     work = count * len(solver.structure.entries)
     threads = (threads or os.cpu_count() or 1) if work >= _WORTH_THREADS else 1
     blocks = np.array_split(np.arange(count), max(-(-count // _MOST_COLUMNS), min(threads, count)))
-    solved = 0
+    solved, stopped = 0, False
 
     def on_steps(steps: int, missing: np.ndarray) -> None:
+        if stopped:
+            raise InterruptedError("another thread ended with an error")
         if on_progress is not None:
             on_progress(solved, steps, float(missing.max()))
 
-    def solve(columns: np.ndarray) -> list[Metastability]:
+    def solve(columns: np.ndarray) -> list[Metastability | ChainError]:
         nonlocal solved
         found = solver.solve(columns, on_steps)
         solved += len(columns)
         return found
 
     if threads == 1 or len(blocks) == 1:
-        return [result for block in blocks for result in solve(block)]
-    with ThreadPoolExecutor(threads) as pool:
-        return [result for found in pool.map(solve, blocks) for result in found]
+        return list(chain.from_iterable(map(solve, blocks)))
+    pool = ThreadPoolExecutor(threads)
+    try:
+        return list(chain.from_iterable(pool.map(solve, blocks)))
+    except BaseException:
+        stopped = True
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _one(targets: np.ndarray, outcomes: np.ndarray, probabilities: np.ndarray) -> Metastability:
+    (found,) = _solve(targets, outcomes, np.ascontiguousarray(probabilities[:, np.newaxis]))
+    if isinstance(found, ChainError):
+        raise found
+    return found
 
 
 def metastabilities(
@@ -515,7 +543,7 @@ def metastabilities(
     *,
     threads: int | None = None,
     on_progress: OnProgress | None = None,
-) -> list[Metastability]:
+) -> list[Metastability | ChainError]:
     """Metastability of the chain over a mesh for many spreads of the slope (eq. 30 to 35).
 
     That takes far less time than one after another. Each result has the same bits as alone, and
@@ -540,15 +568,14 @@ def metastabilities(
 
     Returns
     -------
-    list of Metastability
-        One for each of `sigma_s`, in the same order.
+    list of Metastability or ChainError
+        One for each of `sigma_s`, in the same order. A `ChainError`, which is not raised, stands
+        where a chain mixes too slowly to be iterated and is too large to be solved otherwise.
 
     Raises
     ------
     InputError
         If mu_s or one of sigma_s is not allowed.
-    ChainError
-        If a chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
     columns = []
     for i, sigma in enumerate(sigma_s):
@@ -588,7 +615,7 @@ def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
         If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
     probabilities = slope_probabilities(mesh.slopes, mu_s, sigma_s)
-    return _solve(mesh.targets, mesh.outcomes, probabilities[:, np.newaxis])[0]
+    return _one(mesh.targets, mesh.outcomes, probabilities)
 
 
 def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLike) -> Metastability:
@@ -615,4 +642,4 @@ def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLik
     targets, probabilities = _check_chain(targets, probabilities)
     outcomes = checked_array("outcomes", outcomes, np.uint8, targets.shape)
     check_transitions(targets, outcomes)
-    return _solve(targets, outcomes, np.ascontiguousarray(probabilities[:, np.newaxis]))[0]
+    return _one(targets, outcomes, probabilities)

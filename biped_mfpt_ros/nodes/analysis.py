@@ -6,7 +6,7 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
-from biped_mfpt_ros.chain.markov import ChainError, metastability
+from biped_mfpt_ros.chain.markov import TOLERANCE, ChainError, metastabilities
 from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.nodes.assembly import IncompleteMesh, MeshAssembly
@@ -34,6 +34,8 @@ from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG
 _MOST_UNFINISHED = 64  # meshes being put together, before the oldest is given up
 _MOST_REASONS = 256  # remembered, why meshes cannot be used
 _MOST_SIGMAS = 10_000  # in one request
+_PROGRESS_EVERY = 5.0  # s
+_SIGMAS_AT_ONCE = 64
 _PATIENCE = 10.0  # s, for messages of a mesh that was closed
 
 
@@ -48,6 +50,9 @@ class AnalysisParameters(NodeParameters):
         0.0, "degrees, mean slope to publish MFPT for", -SLOPE_LIMIT_DEG, SLOPE_LIMIT_DEG
     )
     keep_meshes: int = parameter(4, "complete meshes kept for compute_mfpt", 1, 10_000)
+    keep_states: int = parameter(
+        2_000_000, "states of all kept meshes together; the newest is kept anyway", 1, 2**31 - 1
+    )
 
 
 @dataclass(frozen=True)
@@ -64,9 +69,7 @@ def warm_up() -> None:
     mesh = Mesh(
         slopes, states, index, index, [[0, 0], [1, 0]], outcomes, np.ones(STATE_SIZE), 1.0, True
     )
-    # Where a slope has no probability at all, the arrays are others.
-    for sigma_s in (0.1, 1e-4):
-        metastability(mesh, 0.0, sigma_s)
+    metastabilities(mesh, 0.0, [0.1])
 
 
 class Analysis(Node):
@@ -144,14 +147,14 @@ class Analysis(Node):
         try:
             assert assembly.settings is not None
             known = _Known(assembly.mesh(), assembly.settings.controller.name)
-            while len(self._known) >= parameters.keep_meshes:
-                oldest = next(iter(self._known))
-                self._remember(oldest, f"only the last {parameters.keep_meshes} are kept")
-                del self._known[oldest]
-            self._known[mesh_id] = known
+            self._keep(mesh_id, known, parameters)
+            sigmas = [math.radians(sigma_deg) for sigma_deg in parameters.sigma_s_deg]
             mu_s = math.radians(parameters.mu_s_deg)
-            for sigma_deg in parameters.sigma_s_deg:
-                estimate = _estimate(mesh_id, known, mu_s, math.radians(sigma_deg))
+            found = self._solve(mesh_id, known, mu_s, sigmas)
+            for sigma_deg, estimate in zip(parameters.sigma_s_deg, found, strict=True):
+                if isinstance(estimate, ChainError):
+                    self.get_logger().error(f"{mesh_id}: no MFPT at {sigma_deg:g}: {estimate}")
+                    continue
                 self._estimates.publish(estimate)
                 self.get_logger().info(
                     f"{mesh_id}: MFPT {estimate.mfpt:.6g} steps at sigma_s {sigma_deg:g} degrees"
@@ -159,12 +162,67 @@ class Analysis(Node):
         except IncompleteMesh as error:
             self._remember(mesh_id, str(error))
             self.get_logger().error(str(error))
-        except (InputError, ChainError) as error:
+        except InputError as error:
             self.get_logger().error(f"{mesh_id}: no MFPT: {error}")
         except Exception:
             if self.context.ok():
                 self.get_logger().error(f"{mesh_id}: no MFPT\n{traceback.format_exc()}")
         self._finishing.discard(mesh_id)
+
+    def _keep(self, mesh_id: str, known: _Known, parameters: AnalysisParameters) -> None:
+        """Keep a mesh, and let go of the oldest ones that there is no room for."""
+        self._known[mesh_id] = known
+        while len(self._known) > 1 and (
+            len(self._known) > parameters.keep_meshes
+            or sum(len(k.mesh.states) for k in self._known.values()) > parameters.keep_states
+        ):
+            oldest = next(iter(self._known))
+            self._remember(
+                oldest,
+                f"only the last {parameters.keep_meshes} meshes are kept, of at most "
+                f"{parameters.keep_states} states together",
+            )
+            del self._known[oldest]
+
+    def _solve(
+        self, mesh_id: str, known: _Known, mu_s: float, sigmas: list[float]
+    ) -> Iterator[MfptEstimate | ChainError]:
+        """Estimates for several sigma_s, with progress in the log if that takes long."""
+        start = said = time.perf_counter()
+        # What a result brings with it is as long as the mesh: not too many at once.
+        for first in range(0, len(sigmas), _SIGMAS_AT_ONCE):
+            batch = sigmas[first : first + _SIGMAS_AT_ONCE]
+
+            def on_progress(solved: int, steps: int, missing: float, first: int = first) -> None:
+                nonlocal said
+                now = time.perf_counter()
+                if now - said > _PROGRESS_EVERY:
+                    said = now
+                    self.get_logger().info(
+                        f"{mesh_id}: chain of {len(known.mesh.states)} states, {first + solved} of "
+                        f"{len(sigmas)} sigma_s done in {now - start:.0f} s; {steps} steps of the "
+                        f"next, {missing:.0e} to go, ends at {TOLERANCE:.0e}"
+                    )
+
+            begun = time.perf_counter()
+            try:
+                found = metastabilities(known.mesh, mu_s, batch, on_progress=on_progress)
+            except InputError as error:
+                if error.field.startswith("sigma_s["):
+                    index = int(error.field[len("sigma_s[") : -1])
+                    raise InputError(
+                        f"sigma_s[{first + index}]", error.value, error.allowed
+                    ) from None
+                raise
+            seconds = (time.perf_counter() - begun) / len(batch)
+            for sigma_s, result in zip(batch, found, strict=True):
+                yield (
+                    result
+                    if isinstance(result, ChainError)
+                    else estimate_message(
+                        mesh_id, known.controller, known.mesh, mu_s, sigma_s, result, seconds
+                    )
+                )
 
     def _give_up(self, assembly: MeshAssembly, reason: str) -> None:
         del self._unfinished[assembly.mesh_id]
@@ -214,18 +272,14 @@ class Analysis(Node):
                 raise InputError(
                     "sigma_s", f"{len(sigmas)} numbers", f"1 to {_MOST_SIGMAS} numbers"
                 )
-            for i, sigma_s in enumerate(sigmas):
-                try:
-                    estimates.append(_estimate(mesh_id, known, request.mu_s, sigma_s))
-                except InputError as error:
-                    field = f"sigma_s[{i}]" if error.field == "sigma_s" else error.field
-                    raise InputError(field, error.value, error.allowed) from None
+            for i, estimate in enumerate(self._solve(mesh_id, known, request.mu_s, sigmas)):
+                if isinstance(estimate, ChainError):
+                    raise ChainError(f"sigma_s[{i}]: {estimate}")
+                estimates.append(estimate)
             response.estimates = estimates
             response.success = True
-        except InputError as error:
+        except (InputError, ChainError) as error:
             response.message = str(error)
-        except ChainError as error:
-            response.message = f"sigma_s[{len(estimates)}]: {error}"
         except Exception as error:
             self.get_logger().error(f"compute_mfpt failed\n{traceback.format_exc()}")
             response.message = f"internal error of the analysis: {error!r}"
@@ -241,13 +295,6 @@ class Analysis(Node):
         complete = ", ".join(reversed(self._known)) or "none is complete yet"
         allowed = f"a complete mesh: {complete}"
         raise InputError("mesh_id", mesh_id, f"{allowed} (this one: {why})" if why else allowed)
-
-
-def _estimate(mesh_id: str, known: _Known, mu_s: float, sigma_s: float) -> MfptEstimate:
-    start = time.perf_counter()
-    result = metastability(known.mesh, mu_s, sigma_s)
-    seconds = time.perf_counter() - start
-    return estimate_message(mesh_id, known.controller, known.mesh, mu_s, sigma_s, result, seconds)
 
 
 def main(args: list[str] | None = None) -> int:

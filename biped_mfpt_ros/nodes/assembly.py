@@ -18,13 +18,73 @@ class IncompleteMesh(LookupError):
     """A mesh cannot be used: parts of it are missing, or do not fit together."""
 
 
-class MeshAssembly:
-    """One mesh, put together from its messages.
+class _Pieces:
+    """Arrays that follow one another by index, from 1 on, in whichever order they come.
 
-    Messages of one topic come in the order of their publication; the topics may be ahead of one
-    another, and messages of other meshes may lie between. A lost message shows in the indices of
-    the next one, or in the counts of the last. Messages are objects with the fields of
-    `MeshInfo`, `MeshStates` and `MeshTransitions`, as rclpy or a reader of bags makes them.
+    Parameters
+    ----------
+    topic : str
+        Where they come from, for messages.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self.count = 1
+        self._topic = topic
+        self._ready: list[tuple[np.ndarray, ...]] = []
+        self._early: dict[int, tuple[np.ndarray, ...]] = {}
+
+    def add(self, first: int, arrays: tuple[np.ndarray, ...]) -> str:
+        """Take arrays of equal length whose first row has index `first`; returns what is wrong."""
+        if first == 0:
+            return f"{self._topic}: index 0, the failure state, which is never published"
+        if first < self.count or first in self._early:
+            return f"{self._topic}: index {first} came twice"
+        if len(arrays[0]):
+            self._early[first] = arrays
+        while self.count in self._early:
+            self._ready.append(self._early.pop(self.count))
+            self.count += len(self._ready[-1][0])
+        if self._early and min(self._early) < self.count:
+            return f"{self._topic}: index {min(self._early)} came twice"
+        return ""
+
+    def missing(self) -> str:
+        """Where there is a gap, in words; empty if there is none."""
+        if not self._early:
+            return ""
+        return (
+            f"{self._topic}: from index {self.count} to before {min(self._early)} nothing has come"
+        )
+
+    def joined(self, *first: np.ndarray) -> list[np.ndarray]:
+        """Row 0 and all that came, one array for each; may be called once.
+
+        Pieces are let go as they are copied, so that memory never holds all of it twice.
+        """
+        out = [np.empty((self.count, *row.shape), row.dtype) for row in first]
+        for whole, row in zip(out, first, strict=True):
+            whole[0] = row
+        at = 1
+        self._ready.reverse()
+        while self._ready:
+            arrays = self._ready.pop()
+            for whole, piece in zip(out, arrays, strict=True):
+                whole[at : at + len(piece)] = piece
+            at += len(arrays[0])
+        return out
+
+
+class MeshAssembly:
+    """One mesh, put together from its messages, in whichever order they come.
+
+    A middleware may hand a late subscriber new messages before those that were kept for it, the
+    topics may be ahead of one another, and messages of other meshes may lie between. The indices
+    in the messages tell what belongs where, and the counts in the last `MeshInfo` whether all of
+    it has come. So a message that was lost never shows as such: the mesh stays incomplete, and
+    whoever waits decides for how long.
+
+    Messages are objects with the fields of `MeshInfo`, `MeshStates` and `MeshTransitions`, as
+    rclpy or a reader of bags makes them.
 
     Parameters
     ----------
@@ -38,7 +98,7 @@ class MeshAssembly:
     step_map : str
         Identity of the step map that simulated it; empty until then.
     status : int or None
-        Status of the last info.
+        Status of the info that closed the mesh, or of the one that opened it.
     problem : str
         Why the mesh can never become complete; empty as long as it can.
     """
@@ -51,10 +111,9 @@ class MeshAssembly:
         self.problem = ""
         self._final: Any = None
         self._early: list[tuple[Callable[[Any], None], Any]] = []
-        self._states: list[tuple[int, np.ndarray, np.ndarray]] = []
-        self._rows: list[tuple[np.ndarray, np.ndarray]] = []
-        self._state_count = 1
-        self._row_count = 1
+        self._states = _Pieces("mesh/states")
+        self._rows = _Pieces("mesh/transitions")
+        self._mesh: Mesh | None = None
 
     @property
     def complete(self) -> bool:
@@ -63,7 +122,7 @@ class MeshAssembly:
         return (
             not self.problem
             and final is not None
-            and self._state_count == self._row_count == final.states
+            and self._states.count == self._rows.count == final.states
         )
 
     @property
@@ -71,22 +130,25 @@ class MeshAssembly:
         """What is missing, in words; empty if nothing is."""
         if self.problem:
             return self.problem
+        if self.status is None:
+            return "nothing says what it is a mesh of"
+        parts = [self._states.missing(), self._rows.missing()]
         if self._final is None:
-            if self.status is None:
-                return "nothing says what it is a mesh of"
-            return f"it is not finished: {self._state_count} states so far"
-        if not self.complete:
-            return (
-                f"of {self._final.states} states {self._state_count} have come, and the "
-                f"transitions of {self._row_count} (x_1 counted)"
+            parts.insert(0, f"it is not finished: {self._states.count} states so far")
+        elif not self.complete:
+            parts.insert(
+                0,
+                f"of {self._final.states} states {self._states.count} have come, and the "
+                f"transitions of {self._rows.count} (x_1 counted)",
             )
-        return ""
+        return "; ".join(filter(None, parts))
 
     def add_info(self, message: Any) -> None:
         """Take a `MeshInfo`."""
         if self.problem:
             return
-        self.status = message.status
+        if self.status in (None, MeshInfo.GROWING):
+            self.status = message.status
         if message.status in (MeshInfo.FAILED, MeshInfo.CANCELLED):
             how = "failed" if message.status == MeshInfo.FAILED else "was cancelled"
             self._spoil(f"it {how}: {message.message}" if message.message else f"it {how}")
@@ -121,39 +183,45 @@ class MeshAssembly:
         IncompleteMesh
             If parts are missing, or do not fit together.
         """
-        if not self.complete:
-            raise IncompleteMesh(f"mesh {self.mesh_id} cannot be used: {self.missing}")
+        if self._mesh is None:
+            if not self.complete:
+                raise IncompleteMesh(f"mesh {self.mesh_id} cannot be used: {self.missing}")
+            try:
+                self._mesh = self._joined()
+            except InputError as error:
+                self._spoil(str(error))
+                raise IncompleteMesh(f"mesh {self.mesh_id} cannot be used: {error}") from None
+        return self._mesh
+
+    def _joined(self) -> Mesh:
         assert self.settings is not None
         m = len(self.settings.slopes)
-        generations = [np.full(len(states), g) for g, states, _ in self._states]
-        try:
-            return Mesh(
-                slopes=self.settings.slopes,
-                states=np.concatenate(
-                    [np.zeros((1, STATE_SIZE)), *(states for _, states, _ in self._states)]
-                ),
-                preceding=np.concatenate([np.zeros(1, np.uint32), *(p for *_, p in self._states)]),
-                generation=np.concatenate([np.zeros(1, np.uint32), *generations]),
-                targets=np.concatenate(
-                    [np.zeros((1, m), np.uint32), *(targets for targets, _ in self._rows)]
-                ),
-                outcomes=np.concatenate(
-                    [np.full((1, m), NOT_SIMULATED, np.uint8), *(o for _, o in self._rows)]
-                ),
-                scales=unpacked(self._final.scales, "d"),
-                threshold=self.settings.threshold,
-                clustered=self.settings.clustered,
-            )
-        except InputError as error:
-            raise IncompleteMesh(f"mesh {self.mesh_id} cannot be used: {error}") from None
+        states, preceding, generation = self._states.joined(
+            np.zeros(STATE_SIZE), np.uint32(0), np.uint32(0)
+        )
+        targets, outcomes = self._rows.joined(
+            np.zeros(m, np.uint32), np.full(m, NOT_SIMULATED, np.uint8)
+        )
+        return Mesh(
+            slopes=self.settings.slopes,
+            states=states,
+            preceding=preceding,
+            generation=generation,
+            targets=targets,
+            outcomes=outcomes,
+            scales=unpacked(self._final.scales, "d"),
+            threshold=self.settings.threshold,
+            clustered=self.settings.clustered,
+        )
 
     def _spoil(self, problem: str) -> None:
         """Give the mesh up, and the memory of what has come of it."""
         self.problem = problem
-        self._early, self._states, self._rows = [], [], []
+        self._early = []
+        self._states, self._rows = _Pieces("mesh/states"), _Pieces("mesh/transitions")
 
     def _take(self, take: Callable[[Any], None], message: Any) -> None:
-        # Topics may overtake one another; without the slope set nothing can be checked.
+        # Without the slope set nothing can be checked.
         if self.problem:
             return
         if self.settings is None:
@@ -165,16 +233,10 @@ class MeshAssembly:
         states, preceding = unpacked(message.states, "d"), unpacked(message.preceding, "I")
         if states.size != STATE_SIZE * preceding.size:
             self._spoil(f"mesh/states: {states.size} numbers for {preceding.size} states")
-        elif message.first_index != self._state_count:
-            self._spoil(
-                f"mesh/states: the next state was to have index {self._state_count}, not "
-                f"{message.first_index}: messages were lost"
-            )
-        else:
-            rows = states.reshape(-1, STATE_SIZE)
-            self._states.append((message.generation, rows, preceding))
-            self._state_count += len(rows)
-            self._check_counts()
+            return
+        generation = np.broadcast_to(np.uint32(message.generation), preceding.shape)
+        rows = states.reshape(-1, STATE_SIZE)
+        self._add(self._states, message.first_index, (rows, preceding, generation))
 
     def _take_transitions(self, message: Any) -> None:
         assert self.settings is not None
@@ -185,19 +247,21 @@ class MeshAssembly:
                 f"mesh/transitions: {targets.size} targets and {outcomes.size} outcomes for rows "
                 f"of {m} slopes"
             )
-        elif message.first_index != self._row_count:
-            self._spoil(
-                f"mesh/transitions: the next row was to have index {self._row_count}, not "
-                f"{message.first_index}: messages were lost"
-            )
+            return
+        rows = targets.reshape(-1, m), outcomes.reshape(-1, m)
+        self._add(self._rows, message.first_index, rows)
+
+    def _add(self, pieces: _Pieces, first: int, arrays: tuple[np.ndarray, ...]) -> None:
+        wrong = pieces.add(first, arrays)
+        if wrong:
+            self._spoil(wrong)
         else:
-            self._rows.append((targets.reshape(-1, m), outcomes.reshape(-1, m)))
-            self._row_count += targets.size // m
             self._check_counts()
 
     def _check_counts(self) -> None:
-        if self._final is not None and max(self._state_count, self._row_count) > self._final.states:
+        came = max(self._states.count, self._rows.count)
+        if self._final is not None and came > self._final.states:
             self._spoil(
-                f"{self._state_count} states and {self._row_count} rows of transitions came, more "
-                f"than the {self._final.states} that it has (x_1 counted)"
+                f"{self._states.count} states and {self._rows.count} rows of transitions came, "
+                f"more than the {self._final.states} that it has (x_1 counted)"
             )
