@@ -128,6 +128,9 @@ def convergence(name: str, results: Results) -> Picture:
         wide = max(values, default=1.0) > 20.0 * min(values, default=1.0)
         if wide or max(values, default=1.0) > 1e4:
             _steps_axis(axes)
+            # Whole decades, so that at least two powers of ten are there to read the rest by.
+            powers = np.log10([0.8 * min(values), 1.25 * max(values)])
+            axes.set_ylim(10.0 ** np.floor(powers[0]), 10.0 ** np.ceil(powers[1]))
         else:
             axes.set_ylim(0.0, 1.15 * max(values, default=1.0))
         tidy(axes)

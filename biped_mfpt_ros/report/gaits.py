@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
@@ -450,6 +451,7 @@ def torques(swings: Mapping[str, Trace], model: WalkerModel, name: str) -> Pictu
         if not swing.times.size:
             middle = {"ha": "center", "va": "center", "transform": upper.transAxes}
             upper.text(0.5, 0.5, f"falls at once:\n{swing.outcome.label}", **middle)
+        lower.xaxis.set_major_locator(MaxNLocator(4))
         lower.set_xlabel("time since the impact, s")
     # Axes that share a scale show the last one's.
     panels[1, 0].set_ylim(0.0, max(_ratio_top(swing, model) for swing in swings.values()))
