@@ -12,6 +12,7 @@ import os
 import random
 import resource
 import shutil
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -384,6 +385,62 @@ def test_cut_at_any_point_gives_the_messages_before_it(tmp_path):
     # All that was flushed: never lost in the middle of a chunk.
     assert set(saved_counts) <= {0, *range(every, count, every), count}
     assert len(set(saved_counts)) > 3
+
+
+@cache
+def recorded():
+    """The bytes of a bag, and where each of its flushes ended."""
+    bag = Path(tempfile.mkdtemp()) / "bag"
+    writer = write_states(bag, 0, close=False)
+    file = bag / "bag_0.mcap"
+    ends = [file.stat().st_size]
+    for i in range(12):
+        writer.write("/mesh/states", states_message(i), 1000 + i, i, i)
+        if i % 3 == 2:
+            writer.flush()
+            ends.append(file.stat().st_size)
+    writer.close()
+    data = file.read_bytes()
+    shutil.rmtree(bag.parent)
+    return data, ends
+
+
+@settings(deadline=None, max_examples=40)  # others use the machine too
+@given(
+    st.floats(0.0, 1.0),
+    st.sampled_from([b"", b"\0" * 7, b"\0" * 100, b"\0" * 3_000_000, b"\xff" * 50, b"\x05" * 99]),
+    st.booleans(),
+)
+def test_whatever_a_crash_leaves_is_saved_to_the_last_flush(tmp_path_factory, at, end, own):
+    # Cut at any byte; the file system may leave zeros, or what stood there before.
+    data, ends = recorded()
+    length = round(at * (len(data) - 1))
+    path = tmp_path_factory.mktemp("crash")
+    broken = path / "bag" if own else path / "bag_0.mcap"
+    file = broken / "bag_0.mcap" if own else broken
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(data[:length] + end)
+    before, times = file.read_bytes(), file.stat()
+    flushed = 3 * max(0, sum(e <= length for e in ends) - 1)
+    try:
+        saved = salvage(broken, path / "new")
+    except BagError as error:
+        refusal = str(error)
+        assert flushed == 0
+    else:
+        refusal = ""
+        read = [m.message.sequence for m in Bag(path / "new").messages()]
+        # A chunk may be whole although its index is not.
+        assert read in ([*range(flushed)], [*range(flushed + 3)])
+        assert saved.counts == {"/mesh/states": len(read)}
+        assert saved.missing or len(read) == 12
+    said = ("no message in it can be read", "not an MCAP file")
+    assert not refusal or any(text in refusal for text in said)
+    after = file.stat()
+    assert file.read_bytes() == before
+    assert (after.st_mtime_ns, after.st_ino) == (times.st_mtime_ns, times.st_ino)
+    assert {p.name for p in path.rglob("*")} <= {"bag", "bag_0.mcap", "new", "new_0.mcap",
+                                                 "metadata.yaml"}  # fmt: skip
 
 
 def test_cut_bag_says_how_many_messages_are_missing(tmp_path):

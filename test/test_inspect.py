@@ -20,6 +20,7 @@ from biped_mfpt_ros.bag.definitions import message_definition
 from biped_mfpt_ros.bag.metadata import STARTED_LATE
 from biped_mfpt_ros.chain.markov import metastability
 from biped_mfpt_ros.chain.mesh import Mesh, grow_mesh
+from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.nodes import messages as conversion
@@ -337,3 +338,34 @@ def test_messages_of_another_version_are_a_clear_error(tmp_path, mesh):
             writer.write("/mesh/transitions", serialize_message(message), 0, 0)
     with pytest.raises(BagError, match="without 'scales'; allowed: messages of this version"):
         read_meshes(tmp_path / "bag")
+
+
+def test_inspect_repairs_a_cut_off_bag_and_leaves_it_as_it_is(tmp_path, mesh, capsys):
+    bag = Recording(mesh).write(tmp_path / "bag", close=False)
+    file = bag / "bag_0.mcap"
+    before = file.read_bytes()
+    assert main(["inspect", str(bag)]) == 2
+    assert "`biped-mfpt inspect --repair` makes one of what is left" in capsys.readouterr().err
+    new = tmp_path / "new"
+    # All of it had been flushed: nothing but the end is missing.
+    assert main(["inspect", str(bag), "--repair", str(new), "--json"]) == 1
+    written = capsys.readouterr()
+    report = json.loads(written.out)
+    assert report["identical"]
+    assert report["meshes"][0]["estimates"][0]["mfpt"] == metastability(mesh, 0.0, SIGMAS[0]).mfpt
+    (problem,) = report["problems"]
+    assert problem.startswith(f"not saved of {bag}: bag_0.mcap has no end")
+    assert f"saved {report['messages']} messages of {bag} in {new}" in written.err
+    assert main(["inspect", str(new)]) == 0
+    # What is missing is said.
+    os.truncate(file, len(before) // 2)
+    capsys.readouterr()
+    assert main(["inspect", str(bag), "--repair", str(tmp_path / "half")]) == 1
+    text = capsys.readouterr().out
+    assert f"not saved of {bag}: bag_0.mcap is cut off at byte" in text
+    assert "cannot be rebuilt: of 372 states" in text
+    assert file.read_bytes() == before[: len(before) // 2]
+    assert [path.name for path in bag.iterdir()] == ["bag_0.mcap"]
+    # Never over something that is there.
+    assert main(["inspect", str(bag), "--repair", str(new)]) == 2
+    assert "exists already" in capsys.readouterr().err

@@ -6,8 +6,10 @@ import os
 import random
 import resource
 import signal
+import subprocess
 import time
 from collections import Counter
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
@@ -74,6 +76,20 @@ def record(graph, bag, *arguments):
         "recorder", "--ros-args", "-r", "__ns:=/run", "-p", f"bag:={bag}", *arguments
     )
     return process
+
+
+@contextmanager
+def small_disk(path, size):
+    """A file system of its own that is soon full."""
+    path.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"a file system cannot be mounted here: {done.stderr.strip()}")
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "-l", str(path)], check=True)
 
 
 def stop(process, how=signal.SIGTERM):
@@ -283,12 +299,72 @@ def test_full_disk_ends_the_recorder_with_a_clear_error(graph, tmp_path):
     _, log = process.communicate(timeout=20.0)
     assert process.returncode == 1
     assert "[FATAL]" in log
+    assert "Traceback" not in log
     assert f"cannot be written: {os.strerror(27)}; it is not whole" in log
     assert str(bag) in log
     assert flushed_size(bag) <= 100_000
     with pytest.raises(BagError, match="has no end"):
         Bag(bag)
     assert salvage(bag, tmp_path / "saved").counts["/run/mesh/states"] > 0
+
+
+@pytest.mark.parametrize("on_error", ["stop", "go_on"])
+def test_on_a_full_disk_it_stops_or_goes_on_as_told(graph, tmp_path, on_error):
+    with small_disk(tmp_path / "disk", 200_000) as disk:
+        bag = disk / "bag"
+        publisher = graph.start(Publisher)
+        publisher.send("mesh/states", messages.MeshStates())
+        process = record(graph, bag, "-p", "flush_period:=0.05", "-p", f"on_error:={on_error}")
+        wait_for(lambda: publisher.is_recorded("mesh/states"), "mesh/states")
+        number = 0
+        while process.poll() is None and number < 150:
+            number += 1
+            publisher.send("mesh/states", messages.MeshStates(states=noise(number)))
+            time.sleep(0.01)
+        if on_error == "stop":
+            _, log = process.communicate(timeout=20.0)
+            assert "[FATAL]" in log
+        else:
+            # It lives on, and hears the others to the end.
+            assert process.poll() is None
+            publisher.wait_until_received("mesh/states")
+            _, log = stop(process)
+            assert f"received {number + 1} messages of {number + 1} published" in log
+        assert process.returncode == 1
+        assert "Traceback" not in log
+        assert f"cannot be written: {os.strerror(28)}; it is not whole" in log
+        assert f"{bag} is not whole: recording was given up" in log
+        # What could not be kept whole has given its space back, and passes for nothing else.
+        assert [path.name for path in bag.iterdir()] == ["bag_0.mcap"]
+        with pytest.raises(BagError, match="has no end"):
+            Bag(bag)
+        count = salvage(bag, tmp_path / "saved").counts["/run/mesh/states"]
+        assert 10 < count < number
+        states = recorded_states(tmp_path / "saved")
+        assert states == publisher.sent["/run/mesh/states"][:count]
+
+
+@pytest.mark.parametrize("when", ["early", "late"])
+def test_a_restarted_recorder_catches_up(graph, tmp_path, when):
+    publisher = graph.start(Publisher)
+    first = record(graph, tmp_path / "first")
+    for i in range(100):
+        if i == 50:
+            publisher.wait_until_received("mesh/states")
+            first.send_signal(signal.SIGKILL)
+            first.wait()
+            if when == "early":
+                second = record(graph, tmp_path / "second")
+        publisher.send("mesh/states", messages.MeshStates(first_index=i, states=noise(i, 30)))
+    if when == "late":
+        second = record(graph, tmp_path / "second")
+    wait_for((tmp_path / "second" / "second_0.mcap").exists, "the second recorder")
+    wait_for(lambda: flushed(tmp_path / "second")["/run/mesh/states"] == 100, "all messages")
+    code, log = stop(second)
+    assert code == 0
+    assert "/run/mesh/states: received 100 messages of 100 published" in log
+    read = sorted(recorded_states(tmp_path / "second"), key=lambda message: message.sequence)
+    assert read == publisher.sent["/run/mesh/states"]
 
 
 @pytest.mark.parametrize(
@@ -298,6 +374,7 @@ def test_full_disk_ends_the_recorder_with_a_clear_error(graph, tmp_path):
         (("-p", "bag:=/proc/bag"), "cannot be made"),
         (("-p", "flush_period:=2.0"), "flush_period: 2.0 is not allowed; allowed: a number from"),
         (("-p", "further_topics:=a//b"), "further_topics: 'a//b' is not allowed"),
+        (("-p", "on_error:=panic"), "on_error: 'panic' is not allowed; allowed: stop or go_on"),
     ],
 )
 def test_bad_parameter_is_a_clear_error(graph, tmp_path, arguments, text):

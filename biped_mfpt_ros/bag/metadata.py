@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from biped_mfpt_ros.bag.error import BagError
+from biped_mfpt_ros.files import whole_file
 
 FILE_NAME = "metadata.yaml"
 VERSION = 9
@@ -88,15 +89,8 @@ class Metadata:
         OSError
             The disk is full, or not writable.
         """
-        temporary = directory / f".{FILE_NAME}.partial"
-        try:
-            with temporary.open("w", encoding="utf-8") as stream:
-                stream.write(dump_yaml({_ROOT: self._to_dict()}))
-                stream.flush()
-                os.fsync(stream.fileno())
-            temporary.replace(directory / FILE_NAME)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with whole_file(directory / FILE_NAME) as file:
+            file.write(dump_yaml({_ROOT: self._to_dict()}).encode())
 
     def _to_dict(self) -> dict[str, Any]:
         time: dict[str, Any] = {

@@ -26,6 +26,14 @@ MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_LIMIT = 1 << 30
 """Bytes that a chunk may decompress to. What claims more is taken for damage."""
 
+_CHUNK = 1 << 20
+_MOST_ZEROS = 1 << 21
+"""Bytes, more than any whole record ends with."""
+
+_WHOLE = (
+    "a whole rosbag2 bag in MCAP files; `biped-mfpt inspect --repair` makes one of what is left"
+)
+
 # What the libraries raise on bytes that are not what they should be.
 _UNREADABLE = (
     McapError,
@@ -114,7 +122,7 @@ class Bag:
         self._types: dict[str, str] = {}
         self._store = get_typestore(Stores.EMPTY)
         if self.fault and not unfinished:
-            raise BagError(self.path, self.fault)
+            raise BagError(self.path, self.fault, _WHOLE)
 
     @property
     def size(self) -> int:
@@ -262,7 +270,7 @@ class Bag:
             except _UNREADABLE as error:
                 if isinstance(error, BagError):
                     raise
-                raise BagError(path, _damage(error, bounded)) from error
+                raise BagError(path, _damage(error, bounded), _WHOLE) from error
 
     def _add_topic(self, channel: Channel, schema: Schema | None) -> None:
         if channel.topic not in self.topics:
@@ -325,14 +333,37 @@ class _Bounded:
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self.size = os.fstat(stream.fileno()).st_size
+        # What a crash of the machine leaves: blocks that were allotted and never written. As
+        # records of length 0 they would be read nine bytes at a time.
+        self._end = min(self.size, _end_of_data(stream, self.size) + _MOST_ZEROS)
         self.position = 0
         self.whole = 0
         """Where the last record that could be read ends."""
 
     def read(self, length: int) -> bytes:
-        data = self._stream.read(max(0, min(length, self.size - self.position)))
+        data = self._stream.read(max(0, min(length, self._end - self.position)))
         self.position += len(data)
         return data
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether all of it has been read, but for zeros at the end."""
+        return self.position == self._end
+
+
+def _end_of_data(stream: BinaryIO, size: int) -> int:
+    """Where the zeros begin that a file ends with."""
+    end = size
+    while end > 0:
+        start = max(0, end - _CHUNK)
+        stream.seek(start)
+        kept = stream.read(end - start).rstrip(b"\0")
+        if kept:
+            end = start + len(kept)
+            break
+        end = start
+    stream.seek(0)
+    return end
 
 
 def _opened(path: Path) -> BinaryIO:
@@ -379,6 +410,6 @@ def _damage(error: Exception, stream: _Bounded) -> str:
     where = f"at byte {stream.whole} of {stream.size}"
     # The limit is the size of the file.
     short = (EndOfFile, RecordLengthLimitExceeded, struct.error)
-    if isinstance(error, short) or stream.position == stream.size:
+    if isinstance(error, short) or stream.exhausted:
         return f"is cut off {where}"
     return f"is damaged {where}: {error or type(error).__name__}"

@@ -62,6 +62,8 @@ class BagWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[tuple[str, str], int] = {}
         self._closed = False
+        self._whole = 0  # bytes, up to the last flush that succeeded
+        self._pending = 0  # bytes of messages since then
         self._writer = Writer(
             self._stream, chunk_size=_CHUNK_SIZE, compression=CompressionType.ZSTD
         )
@@ -149,6 +151,9 @@ class BagWriter:
             )
         except OSError as error:
             self._fail(error)
+        self._pending += len(data)
+        if self._pending >= _CHUNK_SIZE:
+            self.flush()
         metadata = self._metadata
         if metadata.count == 0:
             metadata.start = metadata.end = log_time
@@ -167,6 +172,8 @@ class BagWriter:
         self._check_open()
         try:
             self._writer.flush()
+            self._stream.flush()
+            self._whole, self._pending = self._stream.tell(), 0
         except OSError as error:
             self._fail(error)
 
@@ -217,6 +224,10 @@ class BagWriter:
         self._closed = True
         with suppress(OSError):
             self._stream.close()
+        # What was written of the rest is of no use, and the others need the space: to say why they
+        # stop, at least.
+        with suppress(OSError):
+            os.truncate(self.path / self._metadata.files[0], self._whole)
         raise BagWriteError(
             error.errno,
             f"cannot be written: {error.strerror}; it is not whole, "

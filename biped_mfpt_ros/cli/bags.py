@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -25,9 +26,18 @@ def inspect(args: argparse.Namespace) -> int:
     if mean is not None and not sigmas:
         raise InputError("--sigma", None, "at least one standard deviation to go with --mean")
     require_ros("biped_mfpt_msgs.msg")
+    from biped_mfpt_ros.bag.repair import salvage
     from biped_mfpt_ros.bag.report import inspect_bag
 
-    report = inspect_bag(args.bag, sigmas, mean)
+    if args.repair is None:
+        report = inspect_bag(args.bag, sigmas, mean)
+    else:
+        saved = salvage(args.bag, args.repair)
+        if not args.quiet:
+            count = sum(saved.counts.values())
+            print(f"saved {count} messages of {saved.source} in {saved.path}", file=sys.stderr)
+        report = inspect_bag(saved.path, sigmas, mean)
+        report.problems[:0] = [f"not saved of {saved.source}: {text}" for text in saved.missing]
     print(json_text(report.to_dict()) if args.json else _text(report))
     return EXIT_FAILED if report.problems or not report.identical else 0
 

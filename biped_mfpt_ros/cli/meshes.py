@@ -16,6 +16,7 @@ from biped_mfpt_ros.cli.kernels import work
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.results import estimate_row, mfpt_table
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.files import whole_file
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.report.progress import duration_text
 
@@ -31,7 +32,7 @@ def mesh(args: argparse.Namespace) -> None:
     grown, result = grow(args)
     if args.output is not None:
         # Under the name that was given: numpy would add an ending to a name.
-        with open(args.output, "xb") as file:
+        with whole_file(args.output, new=True) as file:
             np.savez_compressed(
                 file,
                 **{name: getattr(grown, name) for name in _MESH_ARRAYS},

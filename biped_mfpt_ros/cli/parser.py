@@ -463,6 +463,13 @@ examples:
         "--namespace", metavar="NAME", help="ROS namespace of the nodes (default: unique)"
     )
     run.add_argument(
+        "--on-record-error",
+        choices=("stop", "go_on"),
+        default="stop",
+        help="what to do when the bag cannot be written any more, as on a full disk "
+        "(default: %(default)s)",
+    )
+    run.add_argument(
         "--output",
         metavar="DIR",
         help="new directory for bag, picture and logs (default: runs/TIME-CONTROLLER)",
@@ -796,6 +803,7 @@ run bit for bit.
 examples:
   biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag
   biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag --sigma 0.5 1 1.5 2 --mean -1 --json
+  biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag --repair saved
 """,
         "output",
     )
@@ -812,6 +820,13 @@ examples:
         type=_number,
         metavar="DEG",
         help="degrees, mean slope to go with --sigma (default: 0)",
+    )
+
+    inspect.add_argument(
+        "--repair",
+        metavar="NEW",
+        help="first copy what can be read of a bag that was cut off to this new directory, as a "
+        "whole bag, and read that; BAG stays as it is",
     )
 
     add(

@@ -24,6 +24,7 @@ from biped_mfpt_ros.cli.processes import Child, Processes
 from biped_mfpt_ros.cli.results import estimate_row, mfpt_table, monte_carlo_result
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.files import whole_file
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.report import paper
@@ -80,15 +81,26 @@ def run(args: argparse.Namespace) -> None:
         compile_all(progress.say)
         progress.say(f"running in {directory}, ROS namespace {namespace}")
         pipeline = Pipeline(processes, progress, namespace)
-        pipeline.record(directory / "bag")
+        recorder = pipeline.record(directory / "bag", on_error=args.on_record_error)
         pipeline.start(workers, args.mean, args.sigma)
         result |= pipeline.mesh(settings, mean, dict(zip(sigmas, args.sigma, strict=True)))
         # The walks can have all cores, and the bag is closed whatever happens to them.
         progress.show("stopping the nodes")
         processes.stop()
+        result["bag_whole"] = (directory / "bag" / "metadata.yaml").exists()
+        if not result["bag_whole"]:
+            if args.on_record_error == "stop":
+                raise CommandError(_last_words(recorder))
+            progress.say(
+                f"{directory / 'bag'} is not whole; {directory}/logs/recorder.log says why"
+            )
         result["monte_carlo"] = _walks(controller, model, mean, args, result["estimates"], progress)
         progress.show("drawing")
-        _draw(controller, model, args, result, picture)
+        disk: OSError | None = None
+        try:
+            _draw(controller, model, args, result, picture)
+        except OSError as error:
+            disk = error
     result["files"] = {
         "bag": str(directory / "bag"),
         "picture": str(picture),
@@ -96,8 +108,12 @@ def run(args: argparse.Namespace) -> None:
         "result": str(directory / "result.json"),
     }
     text = json_text(result)
-    (directory / "result.json").write_text(text + "\n")
-    print(text if args.json else _report(result))
+    # Whatever becomes of the files, the result is there to be read.
+    print(text if args.json else _report(result), flush=True)
+    if disk is not None:
+        raise disk
+    with whole_file(directory / "result.json") as file:
+        file.write(f"{text}\n".encode())
 
 
 def _namespace(name: str) -> str:
@@ -151,10 +167,15 @@ class Pipeline:
         self.namespace = namespace
         self._simulators: set[str] = set()
 
-    def record(self, bag: Path) -> Child:
-        """Start a recorder."""
+    def record(self, bag: Path, *, on_error: str = "stop") -> Child:
+        """Start a recorder.
+
+        ``on_error``: whether it is to stop, and so end the run, or to go_on when the bag cannot be
+        written.
+        """
         # It is stopped last, so that it hears what the others say to the end.
-        return self._node("recorder", "recorder", last=True, bag=quoted(str(bag.absolute())))
+        text = quoted(str(bag.absolute()))
+        return self._node("recorder", "recorder", last=True, bag=text, on_error=on_error)
 
     def start(self, workers: int, mean_deg: float, sigma_deg: Sequence[float]) -> None:
         """Start all other nodes."""
@@ -229,10 +250,14 @@ class Pipeline:
         """End the run when a node that it cannot do without has ended."""
         for child in self._processes.newly_ended():
             self._simulators.discard(child.name)
-            message = f"{child.name} {child.ending()}; the end of {child.log}:\n{child.log_tail()}"
+            message = _last_words(child)
             if not child.name.startswith("simulator") or not self._simulators:
                 raise CommandError(message)
             self._progress.say(f"{message}\ngoing on with {len(self._simulators)} simulator(s)")
+
+
+def _last_words(child: Child) -> str:
+    return f"{child.name} {child.ending()}; the end of {child.log}:\n{child.log_tail()}"
 
 
 def _estimate(message: Any, sigma_deg: float, controller: str, mean: float) -> dict[str, Any]:
@@ -296,19 +321,20 @@ def _draw(
         for row in rows
         if row["paper"] is not None
     ]
-    pictures.save_run(
-        path,
-        f"{controller.name} on rough ground",
-        walking,
-        f"a walk on slopes with a standard deviation of {sigma_deg:g}°",
-        np.degrees([point["sigma_s"] for point in result["curve"]]),
-        np.array([point["mfpt"] for point in result["curve"]]),
-        points,
-        [
-            (row["sigma_s_deg"], row["mean_steps"], *row["confidence_interval"])
-            for row in result["monte_carlo"]
-        ],
-    )
+    with whole_file(path) as file:
+        pictures.save_run(
+            file,
+            f"{controller.name} on rough ground",
+            walking,
+            f"a walk on slopes with a standard deviation of {sigma_deg:g}°",
+            np.degrees([point["sigma_s"] for point in result["curve"]]),
+            np.array([point["mfpt"] for point in result["curve"]]),
+            points,
+            [
+                (row["sigma_s_deg"], row["mean_steps"], *row["confidence_interval"])
+                for row in result["monte_carlo"]
+            ],
+        )
 
 
 def _report(result: dict[str, Any]) -> str:

@@ -61,6 +61,17 @@ class RecorderParameters(NodeParameters):
     flush_period: float = parameter(
         0.5, "s, after which a message survives the recorder's death at the latest", 0.01, 1.0
     )
+    on_error: str = parameter(
+        "stop",
+        "what to do when the bag cannot be written any more, as on a full disk: stop, or go_on "
+        "without it, so that the others need not end",
+    )
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        if self.on_error not in ("stop", "go_on"):
+            raise InputError("on_error", self.on_error, "stop or go_on")
 
 
 @dataclass
@@ -102,12 +113,14 @@ class Recorder(Node):
             except _rclpy.RCLError:
                 raise InputError("further_topics", topic, "names of topics") from None
         self._earlier = parameters.earlier
+        self._goes_on = parameters.on_error == "go_on"
         self._recordings: list[_Recording] = []
         self._bag = BagWriter(parameters.bag or time.strftime("pipeline_%Y_%m_%d-%H_%M_%S"))
         if not self._earlier:
             self._bag.custom[STARTED_LATE] = "messages from before it began were not recorded"
         self.failed = False
         """Whether recording had to be given up."""
+        self._stopped = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_PERIOD, self._look, clock=steady)
         self.create_timer(parameters.flush_period, self._flush, clock=steady)
@@ -121,8 +134,9 @@ class Recorder(Node):
 
     def close(self) -> None:
         """Take what has arrived, close the bag, and report."""
-        for recording in self._recordings:
-            self._drain(recording)
+        if not self._stopped:
+            for recording in self._recordings:
+                self._drain(recording)
         if not self.failed:
             try:
                 self._bag.close()
@@ -171,8 +185,6 @@ class Recorder(Node):
         self._recordings.append(recording)
 
     def _record(self, recording: _Recording, data: bytes, info: dict[str, Any]) -> None:
-        if self.failed:
-            return
         sequence = 0
         if recording.check is not None:
             try:
@@ -184,6 +196,8 @@ class Recorder(Node):
                 problem = recording.check.add(sequence, gid and bytes(gid["data"]))
                 if problem:
                     self._log().error(f"{recording.topic}: {problem}")
+        if self.failed:
+            return
         received = info["received_timestamp"] or time.time_ns()
         try:
             self._bag.write(
@@ -212,8 +226,12 @@ class Recorder(Node):
 
     def _give_up(self, error: BagWriteError) -> None:
         self.failed = True
-        self._log().fatal(str(error))
-        self.context.try_shutdown()
+        if self._goes_on:
+            self._log().error(f"{error}; going on without recording (on_error)")
+        else:
+            self._log().fatal(str(error))
+            self._stopped = True  # the subscriptions end with the context
+            self.context.try_shutdown()
 
     def _report(self) -> None:
         logger = self._log()
@@ -232,7 +250,9 @@ class Recorder(Node):
                     f"{recording.topic}: received {check.received} messages of {check.published} "
                     "published"
                 )
-        if not self.failed:
+        if self.failed:
+            logger.error(f"{self._bag.path} is not whole: recording was given up")
+        else:
             logger.info(f"{sum(counts.values())} messages in {self._bag.path}")
 
 

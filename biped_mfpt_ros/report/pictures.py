@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -300,7 +300,7 @@ def draw_mfpt(
 
 
 def save_run(
-    path: Path,
+    file: Path | BinaryIO,
     title: str,
     walking: Walk,
     walk_title: str,
@@ -317,7 +317,7 @@ def save_run(
     left.set_title(title, fontsize=11, loc="left")
     draw_walk(right, walking)
     right.set_title(walk_title, fontsize=11, loc="left")
-    figure.savefig(path)
+    figure.savefig(file, format="png")
 
 
 def _power_of_ten(value: float, position: int | None) -> str:

@@ -18,6 +18,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
+from biped_mfpt_ros.files import whole_file
 from biped_mfpt_ros.walker.outcome import Outcome
 
 WIDTH, DPI = 5.2, 220  # inches, dots per inch
@@ -70,7 +71,7 @@ class Picture:
 
     def save(self, path: str | Path) -> None:
         """Write the file anew; FileExistsError if there is one."""
-        with open(path, "xb") as file:
+        with whole_file(path, new=True) as file:
             file.write(self.data)
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
+from biped_mfpt_ros.files import whole_file
 from biped_mfpt_ros.study.plan import Job
 
 
@@ -46,12 +46,5 @@ class Store:
         """Keep the result of a job, of JSON's types (infinities as the strings of `plain`)."""
         path = self.path(job)
         text = json.dumps({"inputs": job.inputs, "result": result}, indent=1, allow_nan=False)
-        beside = path.with_suffix(f".{os.getpid()}.tmp")
-        try:
-            with beside.open("w") as file:
-                file.write(text + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-            beside.replace(path)
-        finally:
-            beside.unlink(missing_ok=True)
+        with whole_file(path) as file:
+            file.write(f"{text}\n".encode())
