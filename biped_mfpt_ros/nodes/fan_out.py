@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from queue import Empty, SimpleQueue
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +23,8 @@ from biped_mfpt_ros.nodes.messages import packed, steps_from
 _POLL = 0.05  # s, between two looks for simulators that came, went, or are late
 _FIRST_SWING = 1e-4  # s, what a swing is taken to cost until answers tell
 _LEAST_SHARE = 0.2  # of a full chunk, below which splitting costs more than it balances
-_MOST_OUTCOMES = 40_000  # in a chunk: keeps answers near the 1 MB that travel best
+_MOST_BYTES = 1_000_000  # in an answer: larger ones do not travel through shared memory
+_MOST_SWINGS = 2000  # in a chunk: what a simulator takes has its limits
 _MANY_TIMES = 10.0  # how much longer than expected an answer may take before it is late
 _MOST_PATIENCE = 16.0  # by which that may grow
 _QUIET = 1.0  # s without a simulator that answers, before that is worth a word
@@ -41,16 +41,14 @@ class Simulators(Protocol):
     def found(self) -> Collection[str]:
         """Names of those that can be asked now, without the dropped ones."""
 
-    def ask(
-        self,
-        name: str,
-        request: SimulateSteps.Request,
-        answer: Callable[[SimulateSteps.Response], None],
-    ) -> Callable[[], None]:
-        """Send a request. ``answer`` is called with the response, from any thread.
+    def ask(self, name: str, request: SimulateSteps.Request) -> int:
+        """Send a request. Returns a ticket, ascending for each simulator."""
 
-        Returns what to call when the response is no longer wanted.
-        """
+    def answers(self, timeout: float) -> Iterable[tuple[str, int, SimulateSteps.Response]]:
+        """Wait for answers: name, ticket and response of those that came within a time (s)."""
+
+    def wake(self) -> None:
+        """End the wait for answers; from any thread."""
 
     def drop(self, name: str, reason: str) -> None:
         """Leave a simulator out of `found`, for a reason, until it has gone from the graph."""
@@ -126,6 +124,7 @@ class Job:
     _handed_out: int = 1
     _again: deque[_Chunk] = field(default_factory=deque)
     _swing_seconds: float = 0.0
+    _swing_bytes: float = 0.0
     _since: float = field(default_factory=time.monotonic)
 
     @property
@@ -146,7 +145,6 @@ class _Chunk:
 class _Asked:
     chunk: _Chunk
     at: float
-    forget: Callable[[], None]
 
 
 @dataclass
@@ -209,8 +207,6 @@ class FanOut:
         self._available = simulators
         self._log = log
         self._simulators: dict[str, _Simulator] = {}
-        self._answers: SimpleQueue[tuple[str, int, SimulateSteps.Response] | None] = SimpleQueue()
-        self._ticket = 0
         self._looked = -math.inf
         self._usable = -math.inf  # when there was last a simulator that is not late
         self._waiting = False
@@ -239,11 +235,7 @@ class FanOut:
         self._jobs.remove(job)
         for simulator in self._simulators.values():
             for ticket in [t for t, a in simulator.asked.items() if a.chunk.job is job]:
-                simulator.asked.pop(ticket).forget()
-
-    def wake(self) -> None:
-        """End the wait of `step`; from any thread."""
-        self._answers.put(None)
+                del simulator.asked[ticket]
 
     def step(self, timeout: float) -> None:
         """Hand out what can be, and take the answers that come within a time (s)."""
@@ -258,14 +250,8 @@ class FanOut:
             self._ask(simulator, chunk, now)
             if simulator.late:
                 self._repeat(chunk)  # nobody is to wait for it
-        try:
-            answer = self._answers.get(timeout=timeout)
-            while True:
-                if answer is not None:
-                    self._take(*answer)
-                answer = self._answers.get_nowait()
-        except Empty:
-            pass
+        for answer in self._available.answers(timeout):
+            self._take(*answer)
 
     def _next_chunk(self) -> _Chunk | None:
         """The next chunk of the job whose turn it is, of those that have something to do."""
@@ -289,7 +275,9 @@ class FanOut:
     def _size(self, job: Job, ready: int) -> int:
         """Swings of the next chunk: the fewer are left, the smaller, so that all end together."""
         full = round(self.settings.chunk_seconds / (job._swing_seconds or _FIRST_SWING))
-        full = max(1, min(full, _MOST_OUTCOMES // len(job.request.slopes)))
+        # Until answers tell, every step is taken to succeed.
+        size = job._swing_bytes or 81.0 * len(job.request.slopes)
+        full = max(1, min(full, _MOST_SWINGS, int(_MOST_BYTES / size)))
         least = max(1, round(_LEAST_SHARE * full))
         share = math.ceil(ready / (2 * max(1, self.simulators)))
         return min(ready, max(least, min(full, share)))
@@ -321,16 +309,12 @@ class FanOut:
             states=packed(states, "d"),
             previous_slopes=packed(previous, "d"),
         )
-        self._ticket += 1
-        ticket, name, answers = self._ticket, simulator.name, self._answers
         try:
-            forget = self._available.ask(
-                name, request, lambda response: answers.put((name, ticket, response))
-            )
+            ticket = self._available.ask(simulator.name, request)
         except Exception as error:
             self._fail(simulator, chunk, f"could not be asked: {error!r}")
             return
-        simulator.asked[ticket] = _Asked(chunk, now, forget)
+        simulator.asked[ticket] = _Asked(chunk, now)
         job.tally.chunks += 1
 
     def _take(self, name: str, ticket: int, response: SimulateSteps.Response) -> None:
@@ -358,12 +342,14 @@ class FanOut:
             return
         simulator.failures = 0
         swing = max(steps.seconds / n, 1e-7)
-        job._swing_seconds = 0.7 * job._swing_seconds + 0.3 * swing if job._swing_seconds else swing
+        job._swing_seconds = _smoothed(job._swing_seconds, swing)
+        size = (steps.outcomes.nbytes + steps.next_states.nbytes) / n
+        job._swing_bytes = _smoothed(job._swing_bytes, size)
         if simulator.late:
             simulator.late = False
             # A simulator answers in order, so the requests before this one got lost on the way.
             for lost in [earlier for earlier in simulator.asked if earlier < ticket]:
-                simulator.asked.pop(lost).forget()
+                del simulator.asked[lost]
             self._log(f"{name} answers again")
         if chunk.done or job.error is not None:
             return  # it was late, and another one was faster
@@ -390,8 +376,6 @@ class FanOut:
             if gone.asked:
                 self._log(f"{name} has gone with {len(gone.asked)} requests unanswered")
             self._hand_on(gone)
-            for asked in gone.asked.values():
-                asked.forget()
         for simulator in self._simulators.values():
             if simulator.asked and not simulator.late:
                 self._check_late(simulator, now)
@@ -453,8 +437,6 @@ class FanOut:
         del self._simulators[simulator.name]
         self._repeat(chunk)
         self._hand_on(simulator)
-        for asked in simulator.asked.values():
-            asked.forget()
 
     def _why(self) -> str:
         """Why there is no simulator that answers."""
@@ -463,3 +445,8 @@ class FanOut:
         return "; ".join(reasons) or (
             "there is none on the graph; start one with: ros2 run biped_mfpt_ros simulator"
         )
+
+
+def _smoothed(before: float, value: float) -> float:
+    """The value, with those before it in mind; 0 stands for none."""
+    return 0.7 * before + 0.3 * value if before else value

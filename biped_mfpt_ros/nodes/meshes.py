@@ -113,6 +113,7 @@ class Meshes:
         self.states = CountedPublisher(node, MeshStates, "mesh/states", RESULTS)
         self.transitions = CountedPublisher(node, MeshTransitions, "mesh/transitions", RESULTS)
         self.progress = CountedPublisher(node, MeshProgress, "mesh/progress", PROGRESS)
+        self._simulators = simulators
         self.fan_out = FanOut(simulators, self._settings(), node.get_logger().warning)
         self._stopping = False
         self._new: SimpleQueue[_Growing] = SimpleQueue()
@@ -131,7 +132,7 @@ class Meshes:
     def close(self) -> None:
         """Stop all meshes."""
         self._stopping = True
-        self.fan_out.wake()
+        self._simulators.wake()
         self._thread.join()
         self._beside.shutdown(wait=True, cancel_futures=True)
 
@@ -147,7 +148,7 @@ class Meshes:
     def _prepare(self, growing: _Growing) -> None:
         growing.prepare()
         self._new.put(growing)
-        self.fan_out.wake()
+        self._simulators.wake()
 
     def _run(self) -> None:
         looked = time.monotonic()
@@ -207,22 +208,32 @@ class _Growing:
     def guarded(self, do: Callable[..., Any], *args: Any) -> Any:
         """Do something; whatever it raises ends the goal, and None comes back then."""
         try:
-            return do(*args)
-        except Cancelled:
-            self._end(MeshInfo.CANCELLED, "cancelled", resumable=not self._goal.is_cancel_requested)
-        except NoSimulatorError as error:
-            self._end(MeshInfo.FAILED, str(error), resumable=True)
-        except OSError as error:
-            self._end(MeshInfo.FAILED, f"the mesh could not be kept: {error}", resumable=True)
-        except (InputError, NoLimitCycle, MeshLimitError) as error:
-            self._end(MeshInfo.FAILED, str(error))
-        except Exception as error:
-            # When the context has ended, it only tells that nothing can be published any more.
-            if self._meshes.node.context.ok():
-                trace = "".join(traceback.format_exception(error))
-                self._meshes.node.get_logger().error(f"a mesh failed\n{trace}")
+            try:
+                return do(*args)
+            except Cancelled:
+                self._end(
+                    MeshInfo.CANCELLED, "cancelled", resumable=not self._goal.is_cancel_requested
+                )
+            except NoSimulatorError as error:
+                self._end(MeshInfo.FAILED, str(error), resumable=True)
+            except OSError as error:
+                self._end(MeshInfo.FAILED, f"the mesh could not be kept: {error}", resumable=True)
+            except (InputError, NoLimitCycle, MeshLimitError) as error:
+                self._end(MeshInfo.FAILED, str(error))
+            except Exception as error:
+                self._log_error("a mesh failed", error)
                 self._end(MeshInfo.FAILED, f"internal error of the mesher: {error!r}")
+        except Exception as error:
+            # The other meshes go on.
+            self.ended = True
+            self._log_error("the end of a mesh could not be told", error)
         return None
+
+    def _log_error(self, what: str, error: Exception) -> None:
+        # When the context has ended, it only tells that nothing can be published any more.
+        if self._meshes.node.context.ok():
+            trace = "".join(traceback.format_exception(error))
+            self._meshes.node.get_logger().error(f"{what}\n{trace}")
 
     def prepare(self) -> None:
         """Check the settings, find the initial state, and open the mesh."""

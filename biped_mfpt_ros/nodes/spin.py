@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import signal
@@ -16,6 +17,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 
 from biped_mfpt_ros.errors import InputError
+
+# M_MMAP_THRESHOLD, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h. The first is the most that glibc
+# takes; the others bound what a heap keeps.
+_MALLOC = ((-3, 32 << 20), (-1, 64 << 20), (-2, 4 << 20))
 
 
 def prepare_environment() -> None:
@@ -37,6 +42,19 @@ def prepare_environment() -> None:
         raise InputError(
             "ROS_SECURITY_STRATEGY", strategy, "Enforce, when ROS_SECURITY_ENABLE is true"
         )
+
+
+def keep_freed_memory() -> None:
+    """Have the C library keep memory that is freed, within bounds, for the next message.
+
+    By default glibc gives each buffer of some 100 kB and more back to the kernel, and pays a page
+    fault for every 4 kB of the next one. With several buffers to a message that is half of what
+    a message of 1 MB costs (`docs/scale.md`). Another C library is left as it is.
+    """
+    allocator = getattr(ctypes.CDLL(None), "mallopt", None)
+    if allocator is not None:
+        for option, size in _MALLOC:
+            allocator(option, size)
 
 
 class _Interrupt:
@@ -77,6 +95,7 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
     node: Node | None = None
     try:
         prepare_environment()
+        keep_freed_memory()
         try:
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
             node = make()
