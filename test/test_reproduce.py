@@ -65,7 +65,7 @@ def made_up(plan, skip=(), mfpt=1.0, mean_steps=5.0):
                       "failure_shares": {"stance_slips": 1.0}, "seconds": 1.0}  # fmt: skip
         elif job.kind == "tolerance":
             result = {"rows": [{"tolerance": 1e-7, "same": 1.0, "mean_steps": 5.0,
-                                "milliseconds": 0.3}]}  # fmt: skip
+                                "milliseconds": 0.3}], "cost_ratio": 7.5}  # fmt: skip
         else:
             cases = ((False, -1.0, "falls"), (True, 0.0, None), (True, -9.0, None))
             result = {
@@ -326,11 +326,20 @@ class TestWork:
 
     def test_tolerances(self, state):
         settings = {"sigma_deg": 2.0, "walks": 50, "seed": 1, "tolerances": [1e-7, 1e-10]}
-        rows = work.tolerance(Job("tolerance", "hzd/base", settings), state)["rows"]
+        found = work.tolerance(Job("tolerance", "hzd/base", settings), state)
+        assert found["cost_ratio"] is None
+        rows = found["rows"]
         assert [row["tolerance"] for row in rows] == [1e-10, 1e-7]
         assert rows[0]["same"] == 1.0
         # A step would have to pass a failure condition within 1e-7 rad to end otherwise.
         assert rows[1]["same"] >= 0.98
+
+    def test_sliding_costs_at_most_ten_times_a_smooth_law(self):
+        name = "smc/mfpt"
+        cycle = work.cycle(Job("cycle", name))
+        walking, model = controller(name), readings()[name].model
+        # The sliding mode takes some work, or the law would not be what is integrated.
+        assert 1.5 < work.cost_of_sliding(walking, model, cycle["state"]) <= 10.0
 
     def test_slopes(self, state):
         rows = work.slopes(Job("slopes", "hzd/base", {"steps": 20, "steepening_deg": 1.0}), state)[

@@ -151,7 +151,15 @@ def page(
     add("unsaid", "What the paper leaves unsaid", shown("readings"), shown("slopes"))
     if "tolerance" in by:
         rows = by["tolerance"].rows
-        add("tolerance", "Is the sliding mode resolved?", _resolved(rows), shown("tolerance"))
+        ratios = [
+            found["cost_ratio"]
+            for name in results.plan.controllers
+            if (found := results.tolerance(name)) and found["cost_ratio"] is not None
+        ]
+        add(
+            "tolerance", "Is the sliding mode resolved?", _resolved(rows, ratios),
+            shown("tolerance"),
+        )  # fmt: skip
     for name in results.plan.controllers:
         if pictures.get(name):
             drawn = "".join(_figure(picture) for picture in pictures[name])
@@ -252,7 +260,7 @@ def _invariance(table: Table | None) -> str:
     )
 
 
-def _resolved(rows: Sequence[dict[str, Any]]) -> str:
+def _resolved(rows: Sequence[dict[str, Any]], ratios: Sequence[float]) -> str:
     """What the walks with several tolerances tell, in a paragraph."""
     least: dict[str, float] = {}
     cost: dict[str, list[float]] = {}
@@ -269,6 +277,13 @@ def _resolved(rows: Sequence[dict[str, Any]]) -> str:
     if "smc" in least:
         text += f" At least {100.0 * least['smc']:.1f} % of them end with the same step and fall"
         text += f" ({100.0 * least['hzd']:.1f} % in the smooth scheme)." if "hzd" in least else "."
+    if ratios:
+        least_ratio, most = min(ratios), max(ratios)
+        text += (
+            f" A step costs {least_ratio:.1f} to {most:.1f} times the evaluations of the closed "
+            "loop that the same gait takes with α = 1, where the law is smooth: "
+            + ("no more than ten times." if most <= 10.0 else "more than ten times.")
+        )
     if len(cost) == 2:
         ratio = np.mean(cost["smc"]) / np.mean(cost["hzd"])
         text += f" A swing costs {ratio:.1f} times as much as one of the smooth scheme."

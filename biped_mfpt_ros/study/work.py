@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from biped_mfpt_ros.control.controller import Controller, controller
+from biped_mfpt_ros.control.controller import SCHEMES, Controller, controller
 from biped_mfpt_ros.gait.cycle import NoLimitCycle, find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.gait.step import simulate_steps
@@ -22,6 +22,8 @@ from biped_mfpt_ros.walker.robot import WalkerModel
 
 _PHASE_OFF = 0.95  # section 6.3: no torque above this phase
 _MOST_STEPS = 20_000  # of a walk
+_COST_TOLERANCE = 1e-7  # as sliding-mode controllers are walked with
+_COST_SLOPES = np.radians(np.linspace(-3.0, 3.0, 13))
 
 
 def cycle(job: Job) -> dict[str, Any]:
@@ -72,7 +74,10 @@ def walks(job: Job, state: list[float]) -> dict[str, Any]:
 
 
 def tolerance(job: Job, state: list[float]) -> dict[str, Any]:
-    """Whether the same walks end alike, whatever the tolerance of the integrator; on one core."""
+    """Whether the same walks end alike, whatever the tolerance of the integrator; on one core.
+
+    Of a sliding-mode controller also ``cost_ratio``, see `cost_of_sliding`.
+    """
     settings = job.settings
     rows, reference = [], None
     for value in sorted(settings["tolerances"]):
@@ -97,7 +102,29 @@ def tolerance(job: Job, state: list[float]) -> dict[str, Any]:
                 "milliseconds": 1e3 * seconds / int(found.steps.sum()),
             }
         )
-    return {"rows": rows}
+    walking, model = controller(job.controller), readings()[job.controller].model
+    cost = cost_of_sliding(walking, model, state) if walking.scheme == "smc" else None
+    return {"rows": rows, "cost_ratio": cost}
+
+
+def cost_of_sliding(walking: Controller, model: WalkerModel, state: list[float]) -> float:
+    """How many times the work of a smooth law the law of a sliding-mode controller costs.
+
+    The smooth one is the same controller with alpha_i = 1, of which the paper says that it would
+    be a PD controller. Work is evaluations of the closed loop for each simulated second, over
+    single steps from a state onto slopes of -3 to 3 degrees.
+    """
+    smooth = walking.parameters.copy()
+    for i, name in enumerate(SCHEMES[walking.scheme].parameters):
+        if name.startswith("alpha"):
+            smooth[i] = 1.0
+    model = replace(model, tolerance=_COST_TOLERANCE)
+
+    def work(by: Controller) -> float:
+        swings = [simulate_steps(by, [state], [0.0], [slope], model) for slope in _COST_SLOPES]
+        return sum(s.evaluations for s in swings) / sum(float(s.durations[0, 0]) for s in swings)
+
+    return work(walking) / work(Controller(f"{walking.name}/smooth", walking.scheme, smooth))
 
 
 def slopes(job: Job, state: list[float]) -> dict[str, Any]:
