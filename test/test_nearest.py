@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,9 +15,10 @@ from biped_mfpt_ros.chain.nearest import STATE_SIZE, StateSet
 def distances(candidate, states, scales) -> np.ndarray:
     """Eq. (25) to each state, with the terms added up in the same order; shape (n,)."""
     total = np.zeros(len(states))
-    for d in range(STATE_SIZE):
-        standardised = (candidate[d] - states[:, d]) * (1.0 / scales[d])
-        total += standardised * standardised
+    with np.errstate(over="ignore"):
+        for d in range(STATE_SIZE):
+            standardised = (candidate[d] - states[:, d]) * (1.0 / scales[d])
+            total += standardised * standardised
     return total
 
 
@@ -50,6 +53,13 @@ def near_a_surface(rng, n, decimals):
     return np.round(np.stack(columns, axis=1), decimals)
 
 
+def some_far_out(rng, states):
+    """The states, some of them where no grid over the others reaches, or squares overflow."""
+    states[rng.random(len(states)) < 0.02] *= 1e3
+    states[rng.random(len(states)) < 0.005] *= rng.choice([1e9, 1e160, 1e300])
+    return states
+
+
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(0, 300),
@@ -65,13 +75,13 @@ def test_set_is_that_of_going_through_all(seed, n, clusters, decimals, threshold
     for _ in range(3):  # the scales change from one to the next
         scales = rng.choice([0.5, 1.0, 2.0, 3.7], STATE_SIZE)
         scales[rng.permutation(STATE_SIZE)[:unscaled]] = np.inf
-        candidates = near_a_surface(rng, n, decimals)
+        candidates = some_far_out(rng, near_a_surface(rng, n, decimals))
         own = rng.integers(0, clusters, n).astype(np.uint32)
         added, complete = found.extend(candidates, own, scales, threshold)
         assert complete
         assert added.tolist() == reference.extend(candidates, own, scales, threshold)
         assert np.array_equal(found.states, reference.states)
-        queries = near_a_surface(rng, 20, decimals)
+        queries = some_far_out(rng, near_a_surface(rng, 20, decimals))
         own = rng.integers(0, clusters, 20).astype(np.uint32)
         expected = [reference.nearest(q, c, scales)[0] for q, c in zip(queries, own, strict=True)]
         assert found.nearest(queries, own, scales).tolist() == expected
@@ -79,18 +89,19 @@ def test_set_is_that_of_going_through_all(seed, n, clusters, decimals, threshold
 
 @pytest.mark.parametrize("clusters", [1, 7])
 def test_large_set_is_that_of_going_through_all(clusters):
-    # Enough to be sorted and enlarged several times within one call.
+    # Enough to be laid out and enlarged several times within one call.
     rng = np.random.default_rng(clusters)
     candidates = near_a_surface(rng, 6000, 12)
-    own = rng.integers(0, clusters, len(candidates)).astype(np.uint32)
     scales = candidates.std(axis=0)
+    candidates = some_far_out(rng, candidates)
+    own = rng.integers(0, clusters, len(candidates)).astype(np.uint32)
     scales[7] = np.inf  # constant
     found, reference = StateSet(clusters, 100_000), Reference()
     added, complete = found.extend(candidates, own, scales, 0.002)
     assert complete
     assert len(added) > 2000
     assert added.tolist() == reference.extend(candidates, own, scales, 0.002)
-    queries = near_a_surface(rng, 500, 12)
+    queries = some_far_out(rng, near_a_surface(rng, 500, 12))
     own = rng.integers(0, clusters, 500).astype(np.uint32)
     expected = [reference.nearest(q, c, scales)[0] for q, c in zip(queries, own, strict=True)]
     assert found.nearest(queries, own, scales).tolist() == expected
@@ -149,3 +160,22 @@ def test_limit(limit):
     again, complete = found.extend(states[: limit - 1], own[: limit - 1], np.ones(STATE_SIZE), 0.5)
     assert complete
     assert len(again) == 0
+
+
+def test_memory_of_a_state():
+    # 80 bytes are the state itself.
+    rng = np.random.default_rng(3)
+    candidates = near_a_surface(rng, 100_000, 15)
+    own = np.zeros(len(candidates), np.uint32)
+    scales = candidates.std(axis=0) + 0.1
+    tracemalloc.start()
+    try:
+        found = StateSet(1, 1_000_000)
+        for first in range(0, len(candidates), 10_000):
+            piece = slice(first, first + 10_000)
+            found.extend(candidates[piece], own[piece], scales, 0.0)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(found) > 99_000
+    assert peak / len(found) < 400

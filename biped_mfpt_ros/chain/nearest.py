@@ -1,11 +1,15 @@
 """The states of a mesh, and the search for the nearest of them.
 
 Everything that depends on how states are searched is in `StateSet`; the mesh knows its two
-methods, `extend` and `nearest`. The reachable states lie on a quasi-2D manifold, and those of one
-preceding slope near a line. So the states of a cluster are kept sorted along their widest
-dimension, and the search goes outwards from the candidate's place until that dimension alone is
-farther than the nearest state found. This leaves out no state that could be the answer: it is
-always the one that going through all states would give.
+methods, `extend` and `nearest`. The reachable states of one preceding slope lie on a quasi-2D
+manifold. So each cluster has a grid of cells over its two widest principal directions, in the
+standardised coordinates of eq. (25), and a search goes outwards from the candidate's cell, ring by
+ring, until the distance within the grid alone is more than that to the nearest state found. This
+leaves out no state that could be the answer: it is always the one that going through all states
+would give.
+
+The grid is laid out anew when the scales change, as they do from generation to generation, and
+when the number of states has doubled. In between, a new state goes to its cell at once.
 """
 
 from __future__ import annotations
@@ -18,10 +22,19 @@ STATE_SIZE = 10
 """Length of a state: q1..q5 (rad), dq1..dq5 (rad/s)."""
 
 _FIRST_CAPACITY = 256
-# The newest states wait unsorted until they are more than this, and more than this share of all:
-# few enough to go through one by one, and so that sorting anew stays a small part of the work.
-_UNSORTED_STATES = 256
-_UNSORTED_SHARE = 1.0 / 32.0
+_WORTH_A_GRID = 32  # states of a cluster; fewer are gone through one by one
+_STATES_PER_CELL = 1.0  # when the grid is laid out; up to twice that before it is again
+# Rounding of a place in the grid, relative to the width of the grid and to a distance: with
+# sums of ten terms it is below 1e-14.
+_MARGIN = 1e-12
+
+# Columns of what describes the grid of a cluster.
+_CENTRE = slice(0, STATE_SIZE)  # a state in the middle
+_FIRST = slice(STATE_SIZE, 2 * STATE_SIZE)  # cells along the first direction per unit of a state
+_SECOND = slice(2 * STATE_SIZE, 3 * STATE_SIZE)
+_LOW = 3 * STATE_SIZE  # where cells begin, in cells from the centre, in both directions
+_WIDTH = _LOW + 2  # width of a cell, in the unit of the distance
+_GRID_SIZE = _WIDTH + 1
 
 
 @kernel
@@ -35,75 +48,110 @@ def _distance(candidates, position, states, index, weights):
 
 
 @kernel
+def _place(rows, position, grid, columns):
+    """Place of a state in a grid, in cells; moved to the edge if outside. NaN if it has none."""
+    u = -grid[_LOW]
+    v = -grid[_LOW + 1]
+    for d in range(STATE_SIZE):
+        difference = rows[position, d] - grid[d]
+        u += difference * grid[STATE_SIZE + d]
+        v += difference * grid[2 * STATE_SIZE + d]
+    if np.isnan(u) or np.isnan(v):
+        return np.nan, np.nan
+    return min(max(u, 0.0), float(columns[0])), min(max(v, 0.0), float(columns[1]))
+
+
+@kernel
+def _cell(place, columns):
+    """Index of the cell of a place along one direction."""
+    return min(np.int64(place), columns - 1)
+
+
+@kernel
+def _insert(states, index, cluster, grids, columns, first_cells, heads, earlier):
+    """Put a state into the chain of its cell, which goes from high indices to low ones."""
+    u, v = _place(states, index, grids[cluster], columns[cluster])
+    # What has no place is found by those that look everywhere, and by nobody else.
+    if np.isnan(u):
+        u, v = 0.0, 0.0
+    cell = first_cells[cluster] + _cell(u, columns[cluster, 0]) * columns[cluster, 1]
+    cell += _cell(v, columns[cluster, 1])
+    earlier[index] = heads[cell]
+    heads[cell] = index
+
+
+@kernel
 def _nearest_within(
     candidates, position, cluster, weights, limit, any_will_do,
-    states, order, rows, starts, axes, earlier, newest,
+    states, grids, columns, first_cells, heads, earlier,
 ):  # fmt: skip
     """Index of the nearest state of the cluster within `limit`, the lowest of several; 0: none.
 
     With `any_will_do` the search ends at the first state within the limit.
-
-    `rows[starts[c] : starts[c + 1]]` are the sorted states of cluster c, ascending along
-    dimension `axes[c]`, and `order` holds their indices. The unsorted ones form a chain: from
-    `newest[c]` to ever earlier ones, to 0.
     """
     best = limit
     found = 0
-    index = newest[cluster]
-    while index != 0:
-        distance = _distance(candidates, position, states, index, weights)
-        # From high indices to low ones: "not above" lets the lowest index win a tie.
-        if distance <= best:
-            best = distance
-            found = index
-            if any_will_do:
-                return found
-        index = earlier[index]
-
-    axis = axes[cluster]
-    value = candidates[position, axis]
-    weight = weights[axis]
-    begin = starts[cluster]
-    end = starts[cluster + 1]
-    low = begin
-    high = end
-    while low < high:
-        middle = (low + high) // 2
-        if rows[middle, axis] < value:
-            low = middle + 1
-        else:
-            high = middle
-    down = low - 1
-    up = low
+    grid = grids[cluster]
+    rows = columns[cluster, 0]
+    width = columns[cluster, 1]
+    unit = grid[_WIDTH]
+    u, v = _place(candidates, position, grid, columns[cluster])
+    everywhere = np.isnan(u)
+    if everywhere:
+        u, v = 0.0, 0.0
+    own_row = _cell(u, rows)
+    own_column = _cell(v, width)
+    margin = _MARGIN * (rows + width)
+    # How far one may go, in cells, before nothing within `best` can come any more.
+    reach = np.inf if everywhere else np.sqrt(best) / unit * (1.0 + _MARGIN) + margin
+    ring = 0
     while True:
-        gap_down = np.inf
-        gap_up = np.inf
-        if down >= begin:
-            gap_down = ((value - rows[down, axis]) * weight) ** 2
-        if up < end:
-            gap_up = ((value - rows[up, axis]) * weight) ** 2
-        # One term of the sum of squares is never above the sum, in floating point too.
-        if min(gap_down, gap_up) > best or (down < begin and up >= end):
-            break
-        if up >= end or (down >= begin and gap_down <= gap_up):
-            row = down
-            down -= 1
-        else:
-            row = up
-            up += 1
-        distance = _distance(candidates, position, rows, row, weights)
-        if distance < best or (distance == best and (found == 0 or order[row] < found)):
-            best = distance
-            found = order[row]
-            if any_will_do:
-                return found
-    return found
+        top = own_row - ring
+        bottom = own_row + ring
+        left = own_column - ring
+        right = own_column + ring
+        for row in range(max(top, 0), min(bottom, rows - 1) + 1):
+            gap_u = max(row - u, u - (row + 1), 0.0)
+            if gap_u > reach:
+                continue
+            # Of rows in between only the two ends belong to the ring.
+            step = 1 if row in (top, bottom) else max(2 * ring, 1)
+            for column in range(left, right + 1, step):
+                if column < 0 or column >= width:
+                    continue
+                gap_v = max(column - v, v - (column + 1), 0.0)
+                if gap_u * gap_u + gap_v * gap_v > reach * reach:
+                    continue
+                index = heads[first_cells[cluster] + row * width + column]
+                while index != 0:
+                    distance = _distance(candidates, position, states, index, weights)
+                    if distance < best or (distance == best and (found == 0 or index < found)):
+                        best = distance
+                        found = index
+                        if any_will_do:
+                            return found
+                        if not everywhere:
+                            reach = np.sqrt(best) / unit * (1.0 + _MARGIN) + margin
+                    index = earlier[index]
+        # The next ring is at least this far away where there is one.
+        gap = np.inf
+        if top > 0:
+            gap = min(gap, u - top)
+        if bottom < rows - 1:
+            gap = min(gap, bottom + 1 - u)
+        if left > 0:
+            gap = min(gap, v - left)
+        if right < width - 1:
+            gap = min(gap, right + 1 - v)
+        if gap > reach or gap == np.inf:
+            return found
+        ring += 1
 
 
 @kernel
 def _extend(
     candidates, clusters, weights, threshold, start, states, of_cluster, count, added,
-    order, rows, starts, axes, earlier, newest,
+    grids, columns, first_cells, heads, earlier,
 ):  # fmt: skip
     """Add the candidates from `start` on that are new, until all are tested or `added` is full.
 
@@ -114,7 +162,7 @@ def _extend(
         cluster = clusters[position]
         if _nearest_within(
             candidates, position, cluster, weights, threshold, True,
-            states, order, rows, starts, axes, earlier, newest,
+            states, grids, columns, first_cells, heads, earlier,
         ) != 0:  # fmt: skip
             continue
         if n == added.shape[0]:
@@ -123,8 +171,7 @@ def _extend(
         for d in range(STATE_SIZE):
             states[index, d] = candidates[position, d]
         of_cluster[index] = cluster
-        earlier[index] = newest[cluster]
-        newest[cluster] = index
+        _insert(states, index, cluster, grids, columns, first_cells, heads, earlier)
         added[n] = position
         n += 1
     return candidates.shape[0], n
@@ -132,25 +179,56 @@ def _extend(
 
 @kernel
 def _nearest(
-    candidates, clusters, weights, states, order, rows, starts, axes, earlier, newest, out
+    candidates, clusters, weights, states, grids, columns, first_cells, heads, earlier, out
 ):
     for position in range(candidates.shape[0]):
         out[position] = _nearest_within(
             candidates, position, clusters[position], weights, np.inf, False,
-            states, order, rows, starts, axes, earlier, newest,
+            states, grids, columns, first_cells, heads, earlier,
         )  # fmt: skip
 
 
 @kernel
-def _widest_axes(states, of_cluster, weights, lowest, highest, axes):
-    """For each cluster the dimension in which its states are spread widest by eq. (25)."""
+def _moments(states, of_cluster, weights, counts, centres, products):
+    """Mean, and covariance times number of the standardised states of each cluster."""
+    for index in range(1, states.shape[0]):
+        for d in range(STATE_SIZE):
+            centres[of_cluster[index], d] += states[index, d]
+    for cluster in range(counts.shape[0]):
+        for d in range(STATE_SIZE):
+            centres[cluster, d] /= max(counts[cluster], 1)
+    difference = np.empty(STATE_SIZE)
     for index in range(1, states.shape[0]):
         cluster = of_cluster[index]
         for d in range(STATE_SIZE):
-            lowest[cluster, d] = min(lowest[cluster, d], states[index, d])
-            highest[cluster, d] = max(highest[cluster, d], states[index, d])
-    for cluster in range(axes.shape[0]):
-        axes[cluster] = np.argmax((highest[cluster] - lowest[cluster]) * weights)
+            difference[d] = (states[index, d] - centres[cluster, d]) * weights[d]
+        for d in range(STATE_SIZE):
+            for e in range(STATE_SIZE):
+                products[cluster, d, e] += difference[d] * difference[e]
+
+
+@kernel
+def _extents(states, of_cluster, grids, low, high):
+    """Smallest and largest place of each cluster's states along both directions of its grid."""
+    for index in range(1, states.shape[0]):
+        cluster = of_cluster[index]
+        grid = grids[cluster]
+        u = 0.0
+        v = 0.0
+        for d in range(STATE_SIZE):
+            difference = states[index, d] - grid[d]
+            u += difference * grid[STATE_SIZE + d]
+            v += difference * grid[2 * STATE_SIZE + d]
+        low[cluster, 0] = min(low[cluster, 0], u)
+        low[cluster, 1] = min(low[cluster, 1], v)
+        high[cluster, 0] = max(high[cluster, 0], u)
+        high[cluster, 1] = max(high[cluster, 1], v)
+
+
+@kernel
+def _insert_all(states, of_cluster, grids, columns, first_cells, heads, earlier):
+    for index in range(1, states.shape[0]):
+        _insert(states, index, of_cluster[index], grids, columns, first_cells, heads, earlier)
 
 
 class StateSet:
@@ -176,7 +254,7 @@ class StateSet:
         self._states = np.zeros((capacity, STATE_SIZE))
         self._of_cluster = np.zeros(capacity, dtype=np.uint32)
         self._earlier = np.zeros(capacity, dtype=np.uint32)
-        self._sort(np.ones(STATE_SIZE))
+        self._lay_out(np.ones(STATE_SIZE))
 
     def __len__(self) -> int:
         return self._count
@@ -186,38 +264,63 @@ class StateSet:
         """The states, shape (n, 10), row 0 all zeros; a view that the next `extend` outdates."""
         return self._states[: self._count]
 
-    def _sort(self, weights: np.ndarray) -> None:
-        """Sort all states by cluster and, in each, along its widest dimension."""
-        count, clusters = self._count, self._clusters
-        self._sorted = count
-        self._axes = np.zeros(clusters, dtype=np.int64)
-        _widest_axes(
-            self.states,
-            self._of_cluster,
-            weights,
-            np.full((clusters, STATE_SIZE), np.inf),
-            np.full((clusters, STATE_SIZE), -np.inf),
-            self._axes,
-        )
-        of_cluster = self._of_cluster[1:count]
-        along = self._states[np.arange(1, count), self._axes[of_cluster]]
-        sequence = np.lexsort((along, of_cluster))
-        self._order = (sequence + 1).astype(np.uint32)
-        self._rows = self._states[self._order]
-        self._starts = np.searchsorted(of_cluster[sequence], np.arange(clusters + 1))
-        self._newest = np.zeros(clusters, dtype=np.uint32)
+    def _lay_out(self, weights: np.ndarray) -> None:
+        """Lay out the grids for these weights, and put all states into their cells."""
+        clusters, states, of_cluster = self._clusters, self.states, self._of_cluster
+        self._weights, self._laid_out = weights, self._count
+        counts = np.bincount(of_cluster[1:], minlength=clusters)
+        self._grids = np.zeros((clusters, _GRID_SIZE))
+        self._grids[:, _WIDTH] = 1.0
+        self._columns = np.ones((clusters, 2), dtype=np.int64)
+        large = np.flatnonzero(counts >= _WORTH_A_GRID)
+        if len(large):
+            with np.errstate(all="ignore"):
+                self._lay_out_grids(large, counts)
+        self._first_cells = np.concatenate([[0], np.cumsum(self._columns.prod(axis=1))])
+        self._heads = np.zeros(self._first_cells[-1], dtype=np.uint32)
+        _insert_all(states, of_cluster, *self._index())
+
+    def _lay_out_grids(self, large: np.ndarray, counts: np.ndarray) -> None:
+        """Lay out the grids of some clusters; what is beyond any number leaves one of one cell."""
+        states, of_cluster, weights = self.states, self._of_cluster, self._weights
+        centres = np.zeros((self._clusters, STATE_SIZE))
+        products = np.zeros((self._clusters, STATE_SIZE, STATE_SIZE))
+        _moments(states, of_cluster, weights, counts, centres, products)
+        large = large[np.isfinite(products[large]).all(axis=(1, 2))]
+        _, vectors = np.linalg.eigh(products[large])
+        grids = np.zeros((self._clusters, _GRID_SIZE))
+        grids[large, _CENTRE] = centres[large]
+        grids[large, _FIRST] = vectors[:, :, -1] * weights
+        grids[large, _SECOND] = vectors[:, :, -2] * weights
+        low = np.full((self._clusters, 2), np.inf)
+        high = np.full((self._clusters, 2), -np.inf)
+        _extents(states, of_cluster, grids, low, high)
+        extent = (high - low)[large]
+        cells = counts[large] / _STATES_PER_CELL
+        width = np.maximum(np.sqrt(extent.prod(axis=1) / cells), extent.max(axis=1) / cells)
+        usable = np.isfinite(width) & (width > 1e-100)
+        large, extent, width = large[usable], extent[usable], width[usable, np.newaxis]
+        grids[large, _FIRST] /= width
+        grids[large, _SECOND] /= width
+        grids[large, _LOW:_WIDTH] = low[large] / width
+        grids[large, _WIDTH:] = width
+        self._grids[large] = grids[large]
+        self._columns[large] += (extent / width).astype(np.int64)
 
     def _index(self) -> tuple[np.ndarray, ...]:
-        return self._order, self._rows, self._starts, self._axes, self._earlier, self._newest
+        return self._grids, self._columns, self._first_cells, self._heads, self._earlier
 
     def _reserve(self, room: int) -> None:
-        """Make room for that many more states, or up to the limit, growing by doubling."""
+        """Make room for that many more states, or up to the limit."""
         wanted = min(self._limit, self._count + room)
         if wanted > len(self._states):
-            more = min(self._limit, max(wanted, 2 * len(self._states))) - len(self._states)
-            self._states = np.concatenate([self._states, np.zeros((more, STATE_SIZE))])
-            self._of_cluster = np.concatenate([self._of_cluster, np.zeros(more, np.uint32)])
-            self._earlier = np.concatenate([self._earlier, np.zeros(more, np.uint32)])
+            # By half, one array after the other: memory is never twice that of all states.
+            capacity = min(self._limit, max(wanted, len(self._states) * 3 // 2))
+            for name in ("_states", "_of_cluster", "_earlier"):
+                old = getattr(self, name)
+                new = np.zeros((capacity, *old.shape[1:]), dtype=old.dtype)
+                new[: self._count] = old[: self._count]
+                setattr(self, name, new)
 
     def extend(
         self, candidates: np.ndarray, clusters: np.ndarray, scales: np.ndarray, threshold: float
@@ -249,12 +352,12 @@ class StateSet:
         pieces = []
         position = 0
         while True:
-            # Whatever the order, the answer is the same: it is the search that gets longer.
-            room = self._sorted - self._count
-            room += int(max(_UNSORTED_STATES, _UNSORTED_SHARE * self._sorted))
-            if room <= 0:
-                self._sort(weights)
+            # Whatever the grid, the answer is the same: it is the search that gets longer.
+            room = 2 * self._laid_out + 64 - self._count
+            if room <= 0 or not np.array_equal(weights, self._weights):
+                self._lay_out(weights)
                 continue
+            room = min(room, _FIRST_CAPACITY + self._count // 8)
             self._reserve(room)
             added = np.empty(min(room, self._limit - self._count), dtype=np.int64)
             position, n = _extend(
@@ -283,8 +386,8 @@ class StateSet:
             uint32, shape (k,); 0 where the cluster has no state.
         """
         weights = 1.0 / scales
-        if self._sorted < self._count:
-            self._sort(weights)
+        if not np.array_equal(weights, self._weights):
+            self._lay_out(weights)
         out = np.empty(len(candidates), dtype=np.uint32)
         _nearest(candidates, clusters, weights, self._states, *self._index(), out)
         return out
