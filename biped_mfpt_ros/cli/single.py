@@ -10,7 +10,7 @@ from biped_mfpt_ros.cli import options
 from biped_mfpt_ros.cli.kernels import work
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.results import monte_carlo_result, shares_table
-from biped_mfpt_ros.control.controller import catalogue, origin, paper_controller_names
+from biped_mfpt_ros.control.controller import catalogue, confirmed, origin, paper_controller_names
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo as walk
 from biped_mfpt_ros.gait.step import check_states, simulate_steps
@@ -131,7 +131,11 @@ def controllers(args: argparse.Namespace) -> None:
     """List the catalogue."""
     papers = paper_controller_names()
     rows = [paper.figures(name) for name in papers]
-    others = [{"controller": n, "origin": origin(n)} for n in catalogue() if n not in papers]
+    others = [
+        {"controller": n, "origin": origin(n), "confirmed": confirmed(n)}
+        for n in catalogue()
+        if n not in papers
+    ]
     if args.json:
         print(json_text({"controllers": [*rows, *others]}))
         return
@@ -151,8 +155,27 @@ def controllers(args: argparse.Namespace) -> None:
             ],
         )
     )
-    print("\nAs the paper gives them; speed in m/s, MFPT and Monte Carlo in steps. Others:\n")
-    print(table(("controller", "origin"), [(row["controller"], row["origin"]) for row in others]))
+    print("\nAs the paper gives them; speed in m/s, MFPT and Monte Carlo in steps. Found here:\n")
+    found = [(row["controller"], row["confirmed"]) for row in others if row["confirmed"]]
+    print(
+        table(
+            ("controller", "speed", "cost of transport", "MFPT at 1 deg", "Monte Carlo", "at"),
+            [
+                (
+                    name,
+                    figures["speed"],
+                    figures["cost_of_transport"],
+                    figures["mesh"]["mfpt"]["1"],
+                    figures["walks"]["mean_steps"]["5"],
+                    "5 deg",
+                )
+                for name, figures in found
+            ],
+        )
+    )
+    print("\nWhere they come from:\n")
+    for row in others:
+        print(f"{row['controller']}: {row['origin']}")
 
 
 def _beside(reference: float | None) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from biped_mfpt_ros.cli.output import json_text
-from biped_mfpt_ros.control.controller import SCHEMES, Controller
+from biped_mfpt_ros.control.controller import SCHEMES, Controller, catalogue_row
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.store import Store, Trial
 from biped_mfpt_ros.optimise.study import Study
@@ -95,23 +95,8 @@ def described(controller: Controller) -> dict[str, Any]:
         "scheme": controller.scheme,
         "parameters": controller.parameters.tolist(),
         "named": named,
-        "catalogue": _catalogue_row(controller, named),
+        "catalogue": catalogue_row(controller),
     }
-
-
-def _catalogue_row(controller: Controller, named: dict[str, float]) -> dict[str, Any]:
-    """As a row of data/controllers.json."""
-    if controller.scheme == "hzd":
-        bezier = controller.parameters[2:30].reshape(4, 7)
-        return {"kp": named["kp"], "kd": named["kd"], "bezier": bezier.tolist()}
-    if controller.scheme == "smc":
-        return {
-            f"{name}_deg" if "_ref" in name else name: float(np.degrees(value))
-            if "_ref" in name
-            else value
-            for name, value in named.items()
-        }
-    return named
 
 
 def _list(store: Store, args: argparse.Namespace) -> None:

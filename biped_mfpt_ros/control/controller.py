@@ -159,9 +159,47 @@ def paper_controller_names() -> tuple[str, ...]:
 
 
 def origin(name: str) -> str:
-    """Where a controller of the catalogue comes from."""
+    """Where a controller of the catalogue comes from: ``"paper"``, or how to get it again."""
     scheme, _, label = controller(name).name.partition("/")
     return str(_data()[scheme][label].get("origin", "paper"))
+
+
+def confirmed(name: str) -> dict[str, Any] | None:
+    """Figures with which a controller that a search found was entered into the catalogue.
+
+    Returns
+    -------
+    dict or None
+        ``mesh``: ``slope_step_deg``, ``slope_limit_deg``, ``threshold``, ``states``, and ``mfpt``,
+        steps by sigma_s in degrees; ``walks``: ``number``, ``seed``, ``max_steps``, and
+        ``mean_steps`` with ``standard_error``, each by sigma_s in degrees; ``speed`` (m/s) and
+        ``cost_of_transport`` on flat ground; None for others.
+    """
+    scheme, _, label = controller(name).name.partition("/")
+    return _data()[scheme][label].get("confirmed")
+
+
+def catalogue_row(controller: Controller) -> dict[str, Any]:
+    """Parameters as a row of ``data/controllers.json`` has them."""
+    values = controller.parameters.tolist()
+    if controller.scheme == "hzd":
+        return {
+            "kp": values[0],
+            "kd": values[1],
+            "bezier": np.reshape(values[2:30], (4, 7)).tolist(),
+        }
+    if controller.scheme == "smc":
+        return {
+            f"{name}_deg" if "_ref" in name else name: math.degrees(v) if "_ref" in name else v
+            for name, v in zip(smc.PARAMETERS, values, strict=True)
+        }
+    return {
+        "kp": values[:4],
+        "kd": values[4:8],
+        "theta_first": values[8],
+        "theta_last": values[9],
+        "coefficients": np.reshape(values[10:], (4, spline.COEFFICIENTS)).tolist(),
+    }
 
 
 def controller(name: str) -> Controller:

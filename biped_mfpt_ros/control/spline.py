@@ -20,12 +20,12 @@ are absolute, no hybrid invariance is asked for: after each impact the outputs c
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.walker.dynamics import swing_foot
 from biped_mfpt_ros.walker.impact import impact_map
-from biped_mfpt_ros.walker.robot import Robot, WalkerModel
+from biped_mfpt_ros.walker.robot import Robot
 
 COEFFICIENTS = 8
 """Of each output's reference."""
@@ -91,32 +91,33 @@ def command(par, a, da):
     )
 
 
-def references(parameters: np.ndarray, theta: float) -> np.ndarray:
+def references(parameters: np.ndarray, theta: ArrayLike) -> np.ndarray:
     """References of the outputs and their derivatives with respect to the phase.
 
     Parameters
     ----------
     parameters : numpy.ndarray
         As `PARAMETERS`.
-    theta : float
-        Phase, rad.
+    theta : array_like
+        Phases, rad, of any shape.
 
     Returns
     -------
     numpy.ndarray
-        Value (rad), first (1) and second derivative (1/rad) of theta_2, q3, q4, q5; shape (3, 4).
+        Value (rad), first (1) and second derivative (1/rad) of theta_2, q3, q4, q5; shape (3, 4),
+        and then that of the phases.
     """
     first, last = parameters[[_FIRST, _LAST]]
     spacing = (last - first) / (COEFFICIENTS - 1)
-    at = min(max((theta - first) / spacing + 1.0, 0.0), _PIECES - 1.0)
-    piece = int(at)
-    power = at - piece
-    polynomials = _polynomials(parameters)[piece]
-    return np.array(
+    at = np.clip((np.asarray(theta) - first) / spacing + 1.0, 0.0, _PIECES - 1.0)
+    piece = at.astype(np.intp)
+    x = at - piece
+    a0, a1, a2, a3 = np.moveaxis(_polynomials(parameters)[piece], (-1, -2), (0, 1))
+    return np.stack(
         [
-            polynomials @ [1.0, power, power**2, power**3],
-            polynomials @ [0.0, 1.0, 2.0 * power, 3.0 * power**2] / spacing,
-            polynomials @ [0.0, 0.0, 2.0, 6.0 * power] / spacing**2,
+            a0 + x * (a1 + x * (a2 + x * a3)),
+            (a1 + x * (2.0 * a2 + 3.0 * x * a3)) / spacing,
+            (2.0 * a2 + 6.0 * x * a3) / spacing**2,
         ]
     )
 
@@ -138,32 +139,28 @@ def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.nda
     numpy.ndarray
         ``[q, dq]``, rad and rad/s, shape (10,).
     """
-    model = WalkerModel(robot=robot).packed()
-
-    def angles(theta: float) -> np.ndarray:
-        theta2, q3, q4, q5 = references(parameters, theta)[0]
-        theta1 = -theta - 0.5 * q3
-        return np.array([theta1, theta2, theta1 + q3, theta2 + q4, q5])
-
-    def height(theta: float) -> float:
-        return swing_foot(model, np.append(angles(theta), np.zeros(5)))[1]
-
     # The last phase at which the swing foot comes down, else the one where it is lowest.
     first, last = parameters[[_FIRST, _LAST]]
     phases = np.linspace(0.5 * (first + last), 2.0 * last - first, 100)
-    heights = np.array([height(theta) for theta in phases])
-    down = np.flatnonzero((heights[:-1] > 0.0) & (heights[1:] <= 0.0))
-    theta = float(phases[np.argmin(heights)])
-    if down.size:
-        low, high = phases[down[-1]], phases[down[-1] + 1]
-        while high - low > 1e-12:
-            theta = 0.5 * (low + high)
-            low, high = (theta, high) if height(theta) > 0.0 else (low, theta)
-    a = angles(theta)
+    for _ in range(6):
+        heights = robot.swing_foot_position @ np.cos(_angles(parameters, phases))
+        down = np.flatnonzero((heights[:-1] > 0.0) & (heights[1:] <= 0.0))
+        if down.size == 0:
+            break
+        phases = np.linspace(phases[down[-1]], phases[down[-1] + 1], 100)
+    theta = float(phases[0] if down.size else phases[np.argmin(heights)])
+    a = _angles(parameters, theta)
     d2, d3, d4, d5 = references(parameters, theta)[1] * rate
     d1 = -rate - 0.5 * d3
     q = np.array([a[0] - a[4], a[1] - a[4], a[2] - a[0], a[3] - a[1], a[4]])
     return impact_map(np.concatenate([q, [d1 - d5, d2 - d5, d3, d4, d5]]), robot)[0]
+
+
+def _angles(parameters: np.ndarray, theta: ArrayLike) -> np.ndarray:
+    """Absolute angles of the links without tracking error, shape (5,) and that of the phases."""
+    theta2, q3, q4, q5 = references(parameters, theta)[0]
+    theta1 = -np.asarray(theta) - 0.5 * q3
+    return np.stack([theta1, theta2, theta1 + q3, theta2 + q4, q5])
 
 
 def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
