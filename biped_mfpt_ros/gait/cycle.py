@@ -152,7 +152,6 @@ class _Search:
     def __init__(self, controller: Controller, slope: float, model: WalkerModel) -> None:
         self.controller, self.slope, self.model = controller, slope, model
         self._left = _MOST_EVALUATIONS
-        self.seconds = 0.0  # in the step map
 
     def steps(self, states: np.ndarray, behind: float) -> Steps:
         """One step from each state; NoLimitCycle when that costs too much."""
@@ -161,7 +160,6 @@ class _Search:
             self.controller, states, previous, [self.slope], self.model, self._left
         )
         self._left -= steps.evaluations
-        self.seconds += steps.seconds
         if self._left <= 0:
             raise NoLimitCycle(
                 f"no limit cycle of {self.controller.name} found: the search was given up after "
@@ -216,35 +214,3 @@ def _newton(search: _Search, state: np.ndarray) -> LimitCycle | None:
         else:
             return None
     return None
-
-
-def limit_cycle_near(
-    controller: Controller,
-    state: ArrayLike,
-    slope: float = 0.0,
-    model: WalkerModel | None = None,
-) -> tuple[LimitCycle | None, float]:
-    """Refine a state that is nearly periodic to a limit cycle, by Newton's method alone.
-
-    Parameters
-    ----------
-    controller, slope, model
-        As for `find_limit_cycle`.
-    state : array_like
-        ``[q, dq]`` just after an impact on that slope, shape (10,).
-
-    Returns
-    -------
-    cycle : LimitCycle or None
-        None where the iteration does not converge, or takes too long.
-    seconds : float
-        s, spent in the step map.
-    """
-    model = model or WalkerModel()
-    model = replace(model, tolerance=min(model.tolerance, _TOLERANCE))
-    start = check_states(np.asarray(state, dtype=np.float64)[None], "state")[0]
-    search = _Search(controller, slope, model)
-    try:
-        return _newton(search, start), search.seconds
-    except NoLimitCycle:
-        return None, search.seconds

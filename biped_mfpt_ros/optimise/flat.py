@@ -1,4 +1,9 @@
-"""How a candidate walks on flat ground: its limit cycle, or how far it is from one."""
+"""How a candidate walks on flat ground: its limit cycle, or how far it is from one.
+
+Most candidates of a search are decided here, so it has to be cheap: some 50 swings at the model's
+own tolerance, where `find_limit_cycle` takes hundreds at a finer one. The cycle is as exact as a
+mesh needs it for its first state, and its eigenvalues to three digits or so.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +14,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from biped_mfpt_ros.control.controller import Controller
-from biped_mfpt_ros.gait.cycle import LimitCycle, limit_cycle_near
+from biped_mfpt_ros.gait.cycle import LimitCycle
 from biped_mfpt_ros.gait.step import Steps
 from biped_mfpt_ros.gait.trace import trace_swing
 from biped_mfpt_ros.walker.outcome import Outcome
-from biped_mfpt_ros.walker.robot import ABSOLUTE, WalkerModel
+from biped_mfpt_ros.walker.robot import ABSOLUTE, STATE_SIZE, WalkerModel
 
 _RATES = np.linspace(0.6, 3.6, 13)  # rad/s; the paper's cycles lie between 1 and 3
 _MOST_STEPS = 20
-_CLOSE = 0.1  # rad and rad/s, from which on Newton's method is tried
-_NEWTON_TRIES = 4
-_KEPT = 3  # starts that walk on after the third step
+_KEPT = 4  # starts that walk on after the first step: by then the others are no better
 _STRIDE = 0.5  # s, a usual step
+_CLOSE = 0.1  # rad and rad/s, from which on Newton's method is tried
+_NEWTON_TRIES = 3
+_NEWTON_STEPS = 12
+_JACOBIANS = 4
+_DIFFERENCE = 1e-4  # rad and rad/s: the tolerance of 3e-9 leaves four digits of a central one
+_RESIDUAL = 2e-6  # rad and rad/s; states after impact are right to 2e-7 at that tolerance
 
 Simulate = Callable[..., Steps]
 
@@ -32,7 +41,7 @@ class FlatGait:
     Attributes
     ----------
     cycle : LimitCycle or None
-        Its limit cycle, a stable one if there is one.
+        Its limit cycle, a stable one if one was found.
     progress : float
         0 to 1, for one without a limit cycle: the best start's share of steps that it walked, the
         one in which it fell counted by how long it lasted. Of those that walked to the end, the
@@ -43,8 +52,6 @@ class FlatGait:
         m, least height of the swing foot over the middle half of the step; nan without a cycle.
     torque : float
         N m, largest torque of any joint in the cycle; nan without one.
-    refining_seconds : float
-        s spent in the step map by Newton's method, which ``simulate`` has not seen.
     """
 
     cycle: LimitCycle | None
@@ -52,7 +59,6 @@ class FlatGait:
     reason: str
     clearance: float = math.nan
     torque: float = math.nan
-    refining_seconds: float = 0.0
 
 
 def flat_gait(controller: Controller, model: WalkerModel, simulate: Simulate) -> FlatGait:
@@ -81,22 +87,19 @@ def flat_gait(controller: Controller, model: WalkerModel, simulate: Simulate) ->
     states = starts[np.isfinite(starts).all(axis=1)]
     unstable: LimitCycle | None = None
     tries = 0
-    refining = 0.0
-    best = 0.0
+    best, falls = 0.0, Outcome.NOT_FINITE
     nearest = math.inf
-    falls = Outcome.NOT_FINITE
     for walked in range(_MOST_STEPS):
         if not len(states):
             break
         steps = simulate(controller, states, np.zeros(len(states)), [0.0], model)
         upright = steps.outcomes[:, 0] == Outcome.STEP
-        if not upright.all():
-            for outcome, duration in zip(
-                steps.outcomes[~upright, 0], steps.durations[~upright, 0], strict=True
-            ):
-                share = duration / (duration + _STRIDE) if outcome != Outcome.TIME_LIMIT else 0.0
-                if (walked + share) / _MOST_STEPS >= best:
-                    best, falls = (walked + share) / _MOST_STEPS, Outcome(int(outcome))
+        for outcome, duration in zip(
+            steps.outcomes[~upright, 0], steps.durations[~upright, 0], strict=True
+        ):
+            share = 0.0 if outcome == Outcome.TIME_LIMIT else duration / (duration + _STRIDE)
+            if (walked + share) / _MOST_STEPS >= best:
+                best, falls = (walked + share) / _MOST_STEPS, Outcome(int(outcome))
         states, previous = steps.next_states, states[upright]
         if not len(states):
             break
@@ -105,37 +108,113 @@ def flat_gait(controller: Controller, model: WalkerModel, simulate: Simulate) ->
         nearest = float(distances[order[0]])
         if nearest < _CLOSE and tries < _NEWTON_TRIES:
             tries += 1
-            cycle, spent = limit_cycle_near(controller, states[order[0]], 0.0, model)
-            refining += spent
+            cycle = _refined(controller, model, simulate, states[order[0]])
             if cycle is not None and cycle.stable:
-                return _measured(cycle, model, refining)
+                return _measured(cycle, model)
             unstable = unstable or cycle
             if cycle is not None:  # no use in coming back to it
                 order = order[np.abs(states[order] - cycle.state).max(axis=1) > _CLOSE]
-        # By then starts that end alike are alike.
-        states = states[order[:_KEPT] if walked >= 2 else order]
+        states = states[order[:_KEPT]]
     if unstable is not None:
-        return _measured(unstable, model, refining)
+        return _measured(unstable, model)
     if len(states):
-        return FlatGait(
-            None, 1.0 / (1.0 + 0.01 * nearest), "walks without becoming periodic",
-            refining_seconds=refining,
-        )  # fmt: skip
-    return FlatGait(None, 0.9 * best, f"falls: {falls.label}", refining_seconds=refining)
+        return FlatGait(None, 1.0 / (1.0 + 0.01 * nearest), "walks without becoming periodic")
+    return FlatGait(None, 0.9 * best, f"falls: {falls.label}")
 
 
-def _measured(cycle: LimitCycle, model: WalkerModel, refining: float) -> FlatGait:
+def _refined(
+    controller: Controller, model: WalkerModel, simulate: Simulate, state: np.ndarray
+) -> LimitCycle | None:
+    """Limit cycle near a state by Newton's method, with a Jacobian for as long as it serves."""
+
+    def stepped(states: np.ndarray) -> Steps | None:
+        steps = simulate(controller, states, np.zeros(len(states)), [0.0], model)
+        return steps if (steps.outcomes == Outcome.STEP).all() else None
+
+    difference = _DIFFERENCE * np.concatenate([np.eye(STATE_SIZE), -np.eye(STATE_SIZE)])
+
+    def jacobian() -> np.ndarray | None:
+        around = stepped(state + difference)
+        if around is None:
+            return None
+        ahead = around.next_states
+        return (ahead[:STATE_SIZE] - ahead[STATE_SIZE:]).T / (2.0 * _DIFFERENCE)
+
+    steps, slope = stepped(state[None]), jacobian()
+    if steps is None or slope is None:
+        return None
+    residual = steps.next_states[0] - state
+    at, used = state, 1  # where the Jacobian was taken, and how many were
+    for _ in range(_NEWTON_STEPS):
+        size = np.abs(residual).max()
+        if size < _RESIDUAL:
+            if np.abs(state - at).max() > 1e-3:
+                slope = jacobian()
+                if slope is None:
+                    return None
+            return _cycle(controller, model, state, steps, slope, float(size))
+        try:
+            move = np.linalg.solve(slope - np.eye(STATE_SIZE), -residual)
+        except np.linalg.LinAlgError:
+            return None
+        tried = stepped((state + move)[None]) if np.isfinite(move).all() else None
+        new = math.inf if tried is None else np.abs(tried.next_states[0] - state - move).max()
+        if tried is None or new >= size:
+            # A new Jacobian, and if this one is new already a shorter way.
+            if used >= _JACOBIANS:
+                return None
+            if at is state:
+                move = 0.25 * move
+                tried = stepped((state + move)[None]) if np.isfinite(move).all() else None
+                if tried is None or np.abs(tried.next_states[0] - state - move).max() >= size:
+                    return None
+            else:
+                slope, at, used = jacobian(), state, used + 1
+                if slope is None:
+                    return None
+                continue
+        state, steps = state + move, tried
+        residual = steps.next_states[0] - state
+        if np.abs(residual).max() > 0.1 * size and used < _JACOBIANS:
+            slope, at, used = jacobian(), state, used + 1
+            if slope is None:
+                return None
+    return None
+
+
+def _cycle(
+    controller: Controller,
+    model: WalkerModel,
+    state: np.ndarray,
+    steps: Steps,
+    slope: np.ndarray,
+    residual: float,
+) -> LimitCycle | None:
+    """A limit cycle with what its step tells; None if its Jacobian has no eigenvalues."""
+    length = float(steps.step_lengths[0, 0])
+    try:
+        eigenvalues = np.linalg.eigvals(slope)
+    except np.linalg.LinAlgError:
+        return None
+    return LimitCycle(
+        controller=controller,
+        slope=0.0,
+        state=state,
+        period=float(steps.durations[0, 0]),
+        step_length=length,
+        cost_of_transport=float(steps.energies[0, 0])
+        / (model.robot.mass * model.robot.gravity * length),
+        eigenvalues=eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")],
+        residual=residual,
+    )
+
+
+def _measured(cycle: LimitCycle, model: WalkerModel) -> FlatGait:
     """Clearance and torque of a cycle, from one swing."""
     trace = trace_swing(cycle.controller, cycle.state, 0.0, 0.0, model)
-    angles = trace.states[:, :5]
-    foot = _swing_foot(angles, model)
-    middle = np.abs(foot[:, 0]) <= 0.5 * cycle.step_length
-    clearance = float(foot[middle, 1].min()) if middle.any() else math.nan
-    return FlatGait(cycle, 1.0, "", clearance, float(np.abs(trace.torques).max()), refining)
-
-
-def _swing_foot(joints: np.ndarray, model: WalkerModel) -> np.ndarray:
-    """Swing foot from the stance foot, m, shape (k, 2), for joint angles of shape (k, 5)."""
-    absolute = joints @ ABSOLUTE.T
+    absolute = trace.states[:, :5] @ ABSOLUTE.T
     reach = model.robot.swing_foot_position
-    return np.stack([-np.sin(absolute) @ reach, np.cos(absolute) @ reach], axis=1)
+    x, y = -np.sin(absolute) @ reach, np.cos(absolute) @ reach
+    middle = np.abs(x) <= 0.5 * cycle.step_length
+    clearance = float(y[middle].min()) if middle.any() else math.nan
+    return FlatGait(cycle, 1.0, "", clearance, float(np.abs(trace.torques).max()))

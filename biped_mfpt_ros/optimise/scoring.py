@@ -245,7 +245,6 @@ def _evaluate(
     controller = make()
     out.stage, out.score, out.violation = "falls", -4.0 * _TIER, 4.0
     gait = flat_gait(controller, settings.model, clock.simulate)
-    clock.step_map_seconds += gait.refining_seconds
     cycle = gait.cycle
     if cycle is None:
         out.score += gait.progress
