@@ -28,7 +28,7 @@ setup(
             f"biped-mfpt = {NAME}.cli:main",
             *(
                 f"{node} = {NAME}.nodes.{node}:main"
-                for node in ("simulator", "mesher", "analysis", "recorder")
+                for node in ("simulator", "mesher", "analysis", "recorder", "optimiser")
             ),
         ]
     },

@@ -1,4 +1,4 @@
-"""The whole pipeline: simulators, one mesher, analysis and, if wanted, a recorder.
+"""The whole pipeline: simulators, one mesher, analysis, optimiser and, if wanted, a recorder.
 
 ros2 launch biped_mfpt_ros pipeline.launch.py workers:=4
 """
@@ -66,7 +66,7 @@ def generate_launch_description() -> LaunchDescription:
     )
     others = [
         Node(package=PACKAGE, executable=name, namespace=namespace, output="screen")
-        for name in ("mesher", "analysis")
+        for name in ("mesher", "analysis", "optimiser")
     ]
     # The simulators first: an error there comes before anything runs.
     return LaunchDescription([*arguments, OpaqueFunction(function=simulators), recorder, *others])

@@ -14,7 +14,7 @@ import biped_mfpt_ros
 
 PACKAGE = "biped_mfpt_ros"
 ROOT = Path(__file__).parents[1]
-NODES = {"simulator", "mesher", "analysis", "recorder"}
+NODES = {"simulator", "mesher", "analysis", "recorder", "optimiser"}
 
 ROSDEP_KEYS = {
     "PIL": "python3-pil",

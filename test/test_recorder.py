@@ -31,6 +31,7 @@ RESULT_TOPICS = {
     "mesh/transitions": messages.MeshTransitions,
     "mfpt": messages.MfptEstimate,
     "optimisation/trials": messages.OptimisationTrial,
+    "optimisation/best": messages.OptimisationTrial,
 }
 
 

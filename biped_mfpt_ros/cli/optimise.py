@@ -5,20 +5,21 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from biped_mfpt_ros.cli import options
-from biped_mfpt_ros.cli.kernels import work
+from biped_mfpt_ros.cli.kernels import compile_all, work
+from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
-from biped_mfpt_ros.cli.study import best_trial, summary_text, trial_row
+from biped_mfpt_ros.cli.study import summary_text, trial_row
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.local import LocalBackend
 from biped_mfpt_ros.optimise.settings import DEFAULT_STAGES, Stage, StudySettings
 from biped_mfpt_ros.optimise.store import Store, Trial
-from biped_mfpt_ros.optimise.study import Study
+from biped_mfpt_ros.optimise.study import Study, best_trial
 from biped_mfpt_ros.report.progress import Progress, duration_text, rate_text
 from biped_mfpt_ros.report.tables import number
 
@@ -34,19 +35,22 @@ def optimise(args: argparse.Namespace) -> None:
     for option, value, least in (("--workers", workers, 1), ("--trials", args.trials, 1)):
         if value is not None and value < least:
             raise InputError(option, value, f"a whole number >= {least}")
+    if not args.local:
+        require_ros()
     store = Store(Path(args.store))
     study = Study(store, name, settings)
-    stop = threading.Event()
     with work(args.quiet) as progress:
         tally = _Tally(study, progress, workers, args.trials, args.seconds)
         progress.say(
             f"study {name} in {args.store}: {len(study.space)} free parameters, "
             f"{len(tally.before)} trials so far"
         )
-        try:
-            ended = study.run(LocalBackend(), workers, args.trials, args.seconds, tally.add, stop)
-        finally:
-            study.close()
+        if args.local:
+            ended = _locally(study, workers, args, tally)
+        else:
+            compile_all(progress.say)
+            ended = _over_ros(study, workers, args, tally, progress)
+    study.close()
     trials = study.trials()
     result = {
         "study": name,
@@ -71,8 +75,32 @@ def optimise(args: argparse.Namespace) -> None:
     )
 
 
+def _locally(study: Study, workers: int, args: argparse.Namespace, tally: _Tally) -> str:
+    def on_trial(trial: Trial) -> None:
+        assert trial.found is not None
+        found = trial.found
+        tally.add(trial.number, found.score, found.confirmed, found.values, found.step_map_seconds)
+
+    return study.run(LocalBackend(), workers, args.trials, args.seconds, on_trial)
+
+
+def _over_ros(
+    study: Study, workers: int, args: argparse.Namespace, tally: _Tally, progress: Progress
+) -> str:
+    from biped_mfpt_ros.cli.optimise_pipeline import run_study
+
+    def on_trial(trial: Any) -> None:
+        values = dict(zip(trial.measures, trial.measured, strict=True))
+        tally.add(trial.trial, trial.score, trial.confirmed, values, trial.step_map_seconds)
+
+    return run_study(
+        study.name, study.settings, Path(args.store), workers, args.trials, args.seconds,
+        args.record, progress, tally.begin, on_trial,
+    )  # fmt: skip
+
+
 def _settings(args: argparse.Namespace) -> StudySettings:
-    stages = DEFAULT_STAGES
+    stages: tuple[Stage, ...] = DEFAULT_STAGES
     if args.mesh is not None:
         stages = tuple(_stage(i, parts) for i, parts in enumerate(args.mesh))
     if args.check_walks < 0:
@@ -120,32 +148,41 @@ class _Tally:
         self.done = 0
         self._progress, self._workers = progress, workers
         self._limit, self._most_seconds = limit, seconds
-        self._best = best_trial(self.before)
+        best = best_trial(self.before)
+        self._best_text, self._best_score = "nothing", -math.inf
+        if best is not None and best.found is not None:
+            self._best_text, self._best_score = _found_text(best.found.values), best.found.score
         self._step_map_seconds = 0.0
         self._start = time.monotonic()
-        self._study = study
+
+    def begin(self) -> None:
+        """Begin to count the time: what has to be started is there."""
+        self._start = time.monotonic()
 
     @property
     def seconds(self) -> float:
         """Wall time, s."""
         return time.monotonic() - self._start
 
-    def add(self, trial: Trial) -> None:
+    def add(
+        self,
+        number: int,
+        score: float,
+        confirmed: bool,
+        values: Mapping[str, float],
+        step_map_seconds: float,
+    ) -> None:
         """Take a trial in and show the line."""
-        found = trial.found
-        assert found is not None
         self.done += 1
-        self._step_map_seconds += found.step_map_seconds
-        best = self._best.found if self._best is not None else None
-        if found.confirmed and (best is None or found.score > best.score):
-            self._best = trial
-            self._progress.say(f"trial {trial.number}: {_found_text(trial)}")
+        self._step_map_seconds += step_map_seconds
+        if confirmed and score > self._best_score:
+            self._best_score, self._best_text = score, _found_text(values)
+            self._progress.say(f"trial {number}: {self._best_text}")
         throughput = self.throughput()
         rate = throughput["trials_per_second"]
         total = len(self.before) + self.done
         parts = [f"{total} trials" if self._limit is None else f"{total} of {self._limit} trials"]
-        best_text = "nothing" if self._best is None else _found_text(self._best)
-        parts.append(f"best {best_text}")
+        parts.append(f"best {self._best_text}")
         parts.append(f"{rate_text(rate)} trials/s")
         parts.append(f"{100.0 * throughput['outside_step_map']:.0f} % outside the step map")
         left = []
@@ -167,9 +204,6 @@ class _Tally:
         }
 
 
-def _found_text(trial: Trial) -> str:
-    assert trial.found is not None
-    values = trial.found.values
-    parts = [f"{label} {number(values[name])}" for name, label in (
-        ("mfpt", "MFPT"), ("cot", "COT"), ("speed", "speed")) if name in values]  # fmt: skip
-    return ", ".join(parts)
+def _found_text(values: Mapping[str, float]) -> str:
+    labels = {"mfpt": "MFPT", "cot": "COT", "speed": "speed"}
+    return ", ".join(f"{labels[k]} {number(values[k])}" for k in labels if k in values)

@@ -15,7 +15,7 @@ from biped_mfpt_ros import __version__
 
 CLI = "biped_mfpt_ros.cli"
 PICTURES = ("gait", "animation", "phase", "torques", "mesh", "distribution", "falls")
-NODES = ("simulator", "mesher", "analysis", "recorder")
+NODES = ("simulator", "mesher", "analysis", "recorder", "optimiser")
 
 DEFAULT_CONTROLLER = "hzd/mfpt"
 
@@ -234,6 +234,9 @@ def _add_optimise(add: Callable[..., Parser]) -> None:
         "optimise:optimise",
         "search for a controller that takes more steps before it falls",
         """
+Over ROS 2, like `biped-mfpt run`: simulators, mesher, analysis, optimiser and recorder as processes
+of their own, started again if they die; with --local in this process.
+
 Starts at --controller. Each candidate is scored in stages: limit cycle and constraints on flat
 ground, a coarse mesh, finer ones if it is close to the best so far, and Monte Carlo at a larger
 sigma. Only what came through all of them is called the best.
@@ -350,7 +353,15 @@ examples:
         "--workers",
         type=_whole,
         metavar="N",
-        help="trials at the same time (default: one for each core)",
+        help="simulators, or with --local trials at the same time (default: one for each core)",
+    )
+    optimise.add_argument(
+        "--local",
+        action="store_true",
+        help="in this process, without ROS: the same trials, bit for bit",
+    )
+    optimise.add_argument(
+        "--no-record", dest="record", action="store_false", help="keep no bag of what is published"
     )
 
 

@@ -177,10 +177,19 @@ class Pipeline:
         text = quoted(str(bag.absolute()))
         return self._node("recorder", "recorder", last=True, bag=text, on_error=on_error)
 
-    def start(self, workers: int, mean_deg: float, sigma_deg: Sequence[float]) -> None:
+    def start(
+        self, workers: int, mean_deg: float, sigma_deg: Sequence[float], meshes_at_once: int = 4
+    ) -> None:
         """Start all other nodes."""
-        self._node("mesher", "mesher")
-        self._node("analysis", "analysis", mu_s_deg=mean_deg, sigma_s_deg=list(sigma_deg))
+        self._node("mesher", "mesher", meshes_at_once=meshes_at_once)
+        # A mesh may be asked for while the next ones come in.
+        self._node(
+            "analysis",
+            "analysis",
+            mu_s_deg=mean_deg,
+            sigma_s_deg=list(sigma_deg),
+            keep_meshes=4 * meshes_at_once,
+        )
         self._simulators = {f"simulator_{i}" for i in range(1, workers + 1)}
         for name in sorted(self._simulators):
             self._node(name, "simulator")

@@ -117,6 +117,11 @@ class Processes:
         self._reported.update(child.name for child in ended)
         return ended
 
+    def forget(self, child: Child) -> None:
+        """Forget a child that has ended, so that another one may have its name."""
+        self._children.remove(child)
+        self._reported.discard(child.name)
+
     def end(self, child: Child) -> None:
         """Ask one child to end, without waiting for it; `newly_ended` will not report it."""
         self._reported.add(child.name)

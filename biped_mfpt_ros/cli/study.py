@@ -12,7 +12,7 @@ from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.control.controller import SCHEMES, Controller, catalogue_row
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.store import Store, Trial
-from biped_mfpt_ros.optimise.study import Study
+from biped_mfpt_ros.optimise.study import Study, best_trial
 from biped_mfpt_ros.report.tables import table
 
 
@@ -60,12 +60,6 @@ def _save(picture: Any, args: argparse.Namespace) -> None:
         print(json_text({"output": args.output, "caption": picture.caption}))
     else:
         print(f"{picture.caption}\nwritten to {args.output}")
-
-
-def best_trial(trials: list[Trial]) -> Trial | None:
-    """The confirmed trial with the best score, the first of equals; None if there is none."""
-    confirmed = [t for t in trials if t.found is not None and t.found.confirmed]
-    return max(confirmed, key=lambda t: (t.found.score, -t.number), default=None)  # type: ignore[union-attr]
 
 
 def trial_row(study: Study, trial: Trial) -> dict[str, Any]:

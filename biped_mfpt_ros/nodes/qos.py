@@ -25,6 +25,14 @@ PROGRESS = QoSProfile(
 )
 """`mesh/progress`: only the latest counts, so a slow reader may miss some and a late one all."""
 
+LATEST = QoSProfile(
+    reliability=QoSReliabilityPolicy.RELIABLE,
+    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+    history=QoSHistoryPolicy.KEEP_LAST,
+    depth=1,
+)
+"""`optimisation/best`: only the latest counts, and who comes late still gets that one."""
+
 REQUESTS = QoSProfile(
     reliability=QoSReliabilityPolicy.RELIABLE,
     durability=QoSDurabilityPolicy.VOLATILE,

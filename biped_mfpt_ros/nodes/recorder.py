@@ -36,6 +36,7 @@ TOPICS = (
     "mesh/progress",
     "mfpt",
     "optimisation/trials",
+    "optimisation/best",
 )
 """What is always recorded."""
 

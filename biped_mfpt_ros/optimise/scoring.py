@@ -73,10 +73,21 @@ class BackendLost(Exception):
 class GrownMesh(Protocol):
     """A mesh that a backend has grown."""
 
-    mesh_id: str
-    states: int
-    seconds: float
-    step_map_seconds: float
+    @property
+    def mesh_id(self) -> str:
+        """Under which the pipeline knows it; empty for one in memory."""
+
+    @property
+    def states(self) -> int:
+        """States, the failure state counted."""
+
+    @property
+    def seconds(self) -> float:
+        """s, wall time."""
+
+    @property
+    def step_map_seconds(self) -> float:
+        """s in the step map, summed over who worked on it."""
 
     def mfpt(self, mu_s: float, sigma_s: float) -> float:
         """MFPT in steps; MeshFailed if its chain cannot be solved."""

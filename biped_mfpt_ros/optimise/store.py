@@ -279,13 +279,14 @@ class Store:
             )  # fmt: skip
         return cursor.rowcount == 1
 
-    def release(self, study: int, owner: str) -> None:
-        """Give all trials of an owner back that it has not finished."""
+    def release(self, study: int, owner: str, number: int | None = None) -> None:
+        """Give back what an owner has not finished: one trial, or all of them."""
         with self._transaction() as database:
             database.execute(
                 "UPDATE trials SET status = 'pending' "
-                "WHERE study = ? AND status = 'running' AND owner = ?",
-                (study, owner),
+                "WHERE study = ? AND status = 'running' AND owner = ? "
+                "AND number = ifnull(?, number)",
+                (study, owner, number),
             )
 
     def counts(self, study: int) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.jit import STEP_MAP
 from biped_mfpt_ros.optimise.scoring import (
     Backend,
+    BackendLost,
     Best,
     Evaluation,
     Stopped,
@@ -31,6 +32,7 @@ from biped_mfpt_ros.optimise.space import SearchSpace
 from biped_mfpt_ros.optimise.store import Store, Trial, this_owner
 
 _BEAT = 5.0  # s, between two signs of life
+_MOST_LOST = 5  # trials lost in a row with the backend, before the study ends
 _LOOK = 0.2  # s, between two looks for what other processes have finished
 
 
@@ -130,8 +132,8 @@ class Study:
 
         Raises
         ------
-        Exception
-            Whatever a backend raises that does not lie in a candidate; the trial is given back.
+        BackendLost
+            If the backend is lost again and again. The trials are given back.
         """
         stop = stop or threading.Event()
         ended = threading.Event()
@@ -139,6 +141,7 @@ class Study:
         limit = 2**62 if trials is None else trials
         errors: list[BaseException] = []
         reasons: list[str] = []
+        lost = [0]
 
         def work() -> None:
             try:
@@ -154,7 +157,15 @@ class Study:
                         with self._lock:
                             self._lock.wait(_LOOK)
                         continue
-                    self._try(trial, backend, stop, on_trial)
+                    try:
+                        self._try(trial, backend, stop, on_trial)
+                        lost[0] = 0
+                    except BackendLost:
+                        # It is tried again, unless that goes wrong again and again.
+                        self.store.release(self._id, self.owner, trial.number)
+                        lost[0] += 1
+                        if lost[0] >= _MOST_LOST:
+                            raise
             except Stopped:
                 pass
             except BaseException as error:
@@ -251,6 +262,17 @@ class Study:
             if kept and on_trial is not None:
                 on_trial(replace(trial, status="done", found=found, finished=time.time(),
                                  step_map=STEP_MAP))  # fmt: skip
+
+
+def best_trial(trials: list[Trial]) -> Trial | None:
+    """The confirmed trial with the best score, the first of equals; None if there is none."""
+    best: Trial | None = None
+    for trial in trials:
+        if trial.found is None or not trial.found.confirmed:
+            continue
+        if best is None or best.found is None or trial.found.score > best.found.score:
+            best = trial
+    return best
 
 
 def improved(best: Best, found: list[Evaluation]) -> Best:
