@@ -344,7 +344,7 @@ class _Growing:
         job, fan_out = self.job, self._meshes.fan_out
         message = MeshProgress(
             mesh_id=self._mesh_id,
-            generation=self._published - 1,
+            generation=max(0, self._published - 1),  # a mesh may fail before its first is out
             states=job.growth.known,
             frontier=job.frontier,
             swings=job.tally.swings,

@@ -62,8 +62,8 @@ class Optimiser(Node):
     rejection cannot say why.
     """
 
-    def __init__(self) -> None:
-        super().__init__("optimiser")
+    def __init__(self, **settings: Any) -> None:
+        super().__init__("optimiser", **settings)
         self._declared = Declared(self, OptimiserParameters)
         with compiled(self.get_logger().info, "the step map"):
             simulator.warm_up()

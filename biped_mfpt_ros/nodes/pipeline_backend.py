@@ -51,7 +51,10 @@ class PipelineBackend:
         self._node = node
         self._patience = patience
         self._grow = ActionClient(node, GrowMesh, "grow_mesh")
-        self._status = node.resolve_topic_name("grow_mesh/_action/status")
+        # What a node publishes tells it from another one of the same name: the one that died from
+        # the one that took its place, which knows nothing of what was asked.
+        self._of_mesher = node.resolve_topic_name("grow_mesh/_action/status")
+        self._of_analysis = node.resolve_topic_name("mfpt")
         self._compute = node.create_client(ComputeMfpt, "compute_mfpt", qos_profile=REQUESTS)
         self._estimates: OrderedDict[str, list[MfptEstimate]] = OrderedDict()
         self._arrived = threading.Condition()
@@ -121,7 +124,7 @@ class PipelineBackend:
             if not self._grow.server_is_ready():
                 time.sleep(_LOOK)
                 continue
-            mesher = self._mesher()
+            mesher = self._publishers(self._of_mesher)
             handle = self._result(self._grow.send_goal_async(goal), mesher, check)
             if handle is not None and not handle.accepted:  # too many are waiting
                 time.sleep(_LOOK)
@@ -132,13 +135,13 @@ class PipelineBackend:
             raise
         return None if response is None else response.result
 
-    def _mesher(self) -> set[bytes]:
-        """What tells the present mesher from another one of the same name."""
-        found = self._node.get_publishers_info_by_topic(self._status)
+    def _publishers(self, topic: str) -> set[bytes]:
+        """What tells those that publish on a topic now from later ones."""
+        found = self._node.get_publishers_info_by_topic(topic)
         return {bytes(info.endpoint_gid) for info in found}
 
-    def _result(self, future: Future[Any], mesher: set[bytes], check: Check) -> Any:
-        """What a future of the mesher brings, or None if the mesher that was asked is gone."""
+    def _result(self, future: Future[Any], asked: set[bytes], check: Check, topic: str = "") -> Any:
+        """What a future brings, or None if who was asked, the mesher by default, is gone."""
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
         look = time.monotonic() + _ALIVE
@@ -146,7 +149,7 @@ class PipelineBackend:
             check()
             if time.monotonic() > look:
                 look = time.monotonic() + _ALIVE
-                if not self._mesher() & mesher:
+                if not self._publishers(topic or self._of_mesher) & asked:
                     future.cancel()
                     return None
         return future.result()
@@ -185,7 +188,9 @@ class PipelineBackend:
         while time.monotonic() < deadline:
             check()
             if self._compute.service_is_ready():
-                response = self._answer(request, check)
+                analysis = self._publishers(self._of_analysis)
+                future = self._compute.call_async(request)
+                response = self._result(future, analysis, check, self._of_analysis)
                 if response is not None and response.success:
                     return float(response.estimates[0].mfpt)
                 if response is not None:
@@ -194,18 +199,6 @@ class PipelineBackend:
                         raise MeshFailed(message)
             time.sleep(_ASK_AGAIN)
         raise BackendLost(f"no MFPT of mesh {mesh_id} from the analysis: {message}")
-
-    def _answer(self, request: ComputeMfpt.Request, check: Check) -> Any:
-        """The answer of the analysis, or None if it is gone."""
-        done = threading.Event()
-        future = self._compute.call_async(request)
-        future.add_done_callback(lambda _: done.set())
-        while not done.wait(_LOOK):
-            check()
-            if not self._compute.service_is_ready():
-                self._compute.remove_pending_request(future)
-                return None
-        return future.result()
 
 
 @dataclass(frozen=True)
