@@ -87,7 +87,7 @@ class GrownMesh(Protocol):
 
     @property
     def step_map_seconds(self) -> float:
-        """s in the step map, summed over who worked on it."""
+        """S in the step map, summed over who worked on it."""
 
     def mfpt(self, mu_s: float, sigma_s: float) -> float:
         """MFPT in steps; MeshFailed if its chain cannot be solved."""
