@@ -227,6 +227,20 @@ def test_without_a_pipeline_a_study_ends_and_says_why(graph, tmp_path):
     graph.stop(node)
 
 
+@pytest.mark.parametrize("kind", [Simulator, Mesher, Analysis])
+def test_a_node_that_is_replaced_costs_nothing(graph, client, store_path, tmp_path, kind):
+    goal = goal_message(f"without_{kind.__name__}", SETTINGS)
+    goal.max_trials = 30
+    client.trials.clear()
+    result = client.send(goal).get_result_async()
+    wait_for(lambda: len(client.trials) > 5, "some trials", 60.0)
+    node = next(node for node, _, _ in graph._nodes if isinstance(node, kind))
+    graph.stop(node)
+    graph.start(kind)
+    assert result_of(result, 100.0).result.success
+    assert outline(kept(store_path, goal.study)) == locally(tmp_path / "l.sqlite", 30)
+
+
 @pytest.mark.parametrize(
     "victim",
     [

@@ -1,6 +1,7 @@
 """Scores of candidates, stage by stage."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,8 +43,9 @@ class Claims:
         self.grown += 1
         if isinstance(claim, Exception):
             raise claim
-        mesh = type("Mesh", (), dict(mesh_id=f"m{self.grown}", states=self.states, seconds=0.0,
-                                     step_map_seconds=0.0))()  # fmt: skip
+        mesh = SimpleNamespace(
+            mesh_id=f"m{self.grown}", states=self.states, seconds=0.0, step_map_seconds=0.0
+        )
         mesh.mfpt = lambda mu, sigma: claim if sigma == settings.sigma_s else self.checked
         return mesh
 
