@@ -12,12 +12,16 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from biped_mfpt_ros.chain.markov import slope_probabilities
+from biped_mfpt_ros.chain.mesh import grow_mesh
 from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
+from biped_mfpt_ros.gait.step import simulate_steps
 from biped_mfpt_ros.report import html
 from biped_mfpt_ros.report.style import Picture
 from biped_mfpt_ros.study import work
@@ -35,6 +39,7 @@ from biped_mfpt_ros.study.plan import CURVE_DEG, PAPER_MESH, SIGMA_DEG, Job, mak
 from biped_mfpt_ros.study.readings import readings
 from biped_mfpt_ros.study.store import Store
 from biped_mfpt_ros.walker.robot import WalkerModel
+from biped_mfpt_ros.walker.terrain import slope_set
 
 COMMAND = [sys.executable, "-m", "biped_mfpt_ros.cli", "reproduce"]
 
@@ -63,6 +68,8 @@ def made_up(plan, skip=(), mfpt=1.0, mean_steps=5.0):
             result = {"mean_steps": mean_steps, "standard_error": 0.1, "low": mean_steps - 0.2,
                       "high": mean_steps + 0.2, "counted_walks": 90, "falls": 90, "steps": 500,
                       "failure_shares": {"stance_slips": 1.0}, "seconds": 1.0}  # fmt: skip
+        elif job.kind == "counted":
+            result = {"mean_steps": [mean_steps for _ in settings["sigma_deg"]]}
         elif job.kind == "tolerance":
             result = {"rows": [{"tolerance": 1e-7, "same": 1.0, "mean_steps": 5.0,
                                 "milliseconds": 0.3}], "cost_ratio": 7.5}  # fmt: skip
@@ -135,7 +142,7 @@ class TestPlan:
         names = {job.name for job in plan.jobs}
         assert len(names) == len(plan.jobs)
         same = names & {job.name for job in other.jobs}
-        assert {n.split("-")[0] for n in same} == {"cycle", "mesh", "slopes"}
+        assert {n.split("-")[0] for n in same} == {"cycle", "mesh", "counted", "slopes"}
 
     def test_name_depends_on_step_map_and_model(self, monkeypatch):
         job = make_plan(["smc/base"]).of("cycle")[0]
@@ -193,9 +200,12 @@ class TestComparison:
         assert percent(1.0, None) is None
 
     def test_verdicts(self):
-        # mfpt * exp(5): 5.9 at 1 degree. Table 2 has 2.1511 for Monte Carlo.
+        # A chain is judged by the finest mesh, here mfpt * exp(5) at 1 degree, and not by Monte
+        # Carlo, which counts otherwise. Table 2 has 2.1511 for Monte Carlo.
         plan = make_plan(["hzd/base"])
-        rows = {r["number"]: r for r in table_of(made_up(plan, mean_steps=5.9), "holds").rows}
+        results = made_up(plan, mean_steps=5.9, mfpt=5.5 / math.exp(5.0))
+        rows = {r["number"]: r for r in table_of(results, "holds").rows}
+        assert rows["hzd/base: chain at 1°"]["here"] == pytest.approx(5.5)
         assert rows["hzd/base: chain at 1°"]["verdict"] == HOLDS
         assert rows["hzd/base: Monte Carlo at 2°"]["verdict"] == DIFFERS
         assert rows["hzd/base: Monte Carlo at 2°"]["difference"] == pytest.approx(
@@ -211,6 +221,14 @@ class TestComparison:
         rows = {r["number"]: r for r in table_of(results, "holds").rows}
         assert rows["hzd/base: chain at 1°"]["by"] == "finest mesh"
         assert rows["hzd/base: chain at 1°"]["verdict"] == HOLDS
+
+    def test_mesh_is_compared_with_monte_carlo_as_that_counts(self):
+        plan = make_plan(["hzd/base"])
+        results = made_up(plan, mean_steps=5.0)
+        row = table_of(results, "convergence").rows[0]
+        assert row["counted_2"] == 5.0
+        assert row["bias_2"] == pytest.approx(0.0)
+        assert row["mfpt_2"] == pytest.approx(math.exp(2.5))
 
     def test_no_result_at_all(self):
         plan = make_plan(["hzd/base"])
@@ -323,6 +341,28 @@ class TestWork:
         assert found["mean_steps"] == walked.mean_steps
         assert (found["low"], found["high"]) == walked.confidence_interval
         assert found["steps"] == walked.steps.sum()
+
+    def test_mesh_predicts_walks(self, state):
+        """A chain counted as walks are: by adding up first steps and walks through the mesh."""
+        slopes = slope_set(1.0)
+        mesh = grow_mesh(
+            lambda states, behind: simulate_steps(controller("hzd/base"), states, behind, slopes),
+            state, slopes, 0.1,
+        )  # fmt: skip
+        probabilities = slope_probabilities(slopes, 0.0, math.radians(2.0))
+        random = np.random.default_rng(1)
+        counts = []
+        for _ in range(20_000):
+            at, steps = 1, 0
+            while at:
+                at = mesh.targets[at, random.choice(len(slopes), p=probabilities)]
+                steps += 1
+            if steps > 1:
+                counts.append(steps - 1)
+        error = np.std(counts) / math.sqrt(len(counts))
+        assert work.mean_walk(mesh, math.radians(2.0)) == pytest.approx(
+            np.mean(counts), abs=4.0 * error
+        )
 
     def test_tolerances(self, state):
         settings = {"sigma_deg": 2.0, "walks": 50, "seed": 1, "tolerances": [1e-7, 1e-10]}

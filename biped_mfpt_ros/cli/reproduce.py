@@ -162,6 +162,7 @@ def _compute(study: _Study, processes: Processes, directory: Path, number: int) 
 
 
 _DO: dict[str, Callable[..., dict[str, Any]]] = {
+    "counted": work.counted,
     "walks": work.walks,
     "tolerance": work.tolerance,
     "slopes": work.slopes,
@@ -176,6 +177,13 @@ def _call(
     arguments: tuple[Any, ...] = (job, study.state(job.controller))
     if job.kind == "pictures":
         arguments += _mesh_of_pictures(study, job, directory)
+    elif job.kind == "counted":
+        (mesh,) = (
+            study.results[grown.name]
+            for grown in study.plan.of("mesh", job.controller)
+            if all(grown.settings[k] == job.settings[k] for k in ("slope_step_deg", "threshold"))
+        )
+        arguments += (directory / mesh["bag"], mesh["mesh_id"])
     return _DO[job.kind], arguments
 
 

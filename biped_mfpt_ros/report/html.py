@@ -211,7 +211,9 @@ _CONVERGENCE = """<p>The MFPT of a mesh is that of the walker only when the mesh
 d<sub>thr</sub>, the distance from which on a state is a new one, and d<sub>s</sub>, the spacing of
 the slopes, are made smaller until it settles. Where walks are short enough, Monte Carlo is the
 judge: its walks meet any slope, not only those of the set, and no state is replaced by a near one.
-What remains of the difference on the finest mesh is the spacing of the slopes.</p>"""
+It is compared with what the same chain says of such walks, from the limit cycle and without their
+first step. Where falls are frequent that is up to some per cent from eq. (34), which is about a
+walker that has not fallen for long.</p>"""
 
 
 def _tiles(results: Results, by: Mapping[str, Table]) -> str:

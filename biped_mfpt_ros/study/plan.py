@@ -90,8 +90,8 @@ class Job:
     Attributes
     ----------
     kind : str
-        ``cycle``, ``mesh``, ``walks``, ``tolerance``, ``slopes`` or ``pictures``; ``reading`` or
-        ``scatter`` in a fit of the readings.
+        ``cycle``, ``mesh``, ``counted``, ``walks``, ``tolerance``, ``slopes`` or ``pictures``;
+        ``reading`` or ``scatter`` in a fit of the readings.
     controller : str
         What walks.
     settings : dict
@@ -222,6 +222,10 @@ def make_plan(
                     2.0 + _STATES[name] * finer * _SWING[scheme] / 2.0,
                 )
             )
+            # At the sigmas at which there are walks: to be compared with them.
+            mesh = {"slope_step_deg": d_s, "threshold": d_thr}
+            counted = mesh | {"sigma_deg": sorted(_WALKS[name])}
+            jobs.append(Job("counted", name, counted, 0.1 + 0.1 * jobs[-1].seconds))
     for name in names:
         scheme = scheme_of(name)
         for sigma, share in _WALKS[name].items():

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from biped_mfpt_ros.chain.markov import ChainError, metastability, slope_probabilities
+from biped_mfpt_ros.chain.mesh import Mesh
 from biped_mfpt_ros.control.controller import SCHEMES, Controller, controller
 from biped_mfpt_ros.gait.cycle import NoLimitCycle, find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
@@ -71,6 +73,34 @@ def walks(job: Job, state: list[float]) -> dict[str, Any]:
         "steps": int(found.steps.sum()),
         "seconds": time.perf_counter() - start,
     }
+
+
+def counted(job: Job, state: list[float], bag: Path, mesh_id: str) -> dict[str, Any]:
+    """Mean steps that the mesh of a bag predicts for `walks`; None where there is no telling."""
+    from biped_mfpt_ros.bag import read_meshes
+
+    mesh = read_meshes(bag)[mesh_id].mesh
+    assert mesh is not None
+    means = []
+    for sigma_deg in job.settings["sigma_deg"]:
+        try:
+            means.append(mean_walk(mesh, math.radians(sigma_deg)))
+        except ChainError:
+            means.append(None)
+    return {"mean_steps": means}
+
+
+def mean_walk(mesh: Mesh, sigma_s: float) -> float:
+    """Mean steps of walks from x_2 of a mesh, counted as the paper's Monte Carlo counts.
+
+    Eq. (34) is about a walker that has not fallen for long. Walks start on the limit cycle, their
+    first step is dropped, and those that fall in it are not counted: where falls are frequent,
+    that makes a difference of some per cent.
+    """
+    times = metastability(mesh, 0.0, sigma_s).mfpt_from_state
+    probabilities = slope_probabilities(mesh.slopes, 0.0, sigma_s)
+    second = mesh.targets[1]  # where the first step leads
+    return float(probabilities @ times[second] / probabilities[second > 0].sum())
 
 
 def tolerance(job: Job, state: list[float]) -> dict[str, Any]:
