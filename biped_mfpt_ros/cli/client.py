@@ -23,6 +23,7 @@ from rclpy.task import Future
 from biped_mfpt_ros.cli import CommandError
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
+from biped_mfpt_ros.nodes.spin import security_explained
 
 _POLL = 0.05  # s
 
@@ -56,12 +57,13 @@ class Client:
         self._watch = watch
         self._context = Context()
         # Signals belong to the processes' supervisor, and the log to the terminal.
-        rclpy.init(
-            args=["--ros-args", "--disable-external-lib-logs", "--log-level", "error"],
-            context=self._context,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self._node = Node("run", namespace=namespace, context=self._context)
+        with security_explained():
+            rclpy.init(
+                args=["--ros-args", "--disable-external-lib-logs", "--log-level", "error"],
+                context=self._context,
+                signal_handler_options=SignalHandlerOptions.NO,
+            )
+            self._node = Node("run", namespace=namespace, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._grow = ActionClient(self._node, GrowMesh, "grow_mesh")

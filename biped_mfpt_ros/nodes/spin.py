@@ -8,7 +8,8 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 import rclpy
@@ -33,7 +34,9 @@ def prepare_environment() -> None:
     InputError
         If security is asked for in a way that would go on without it.
     """
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    # Set to nothing it would be ROS 2's own default, which is the subnet.
+    if not os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     enabled = os.environ.get("ROS_SECURITY_ENABLE", "false").lower() == "true"
     strategy = os.environ.get("ROS_SECURITY_STRATEGY", "Permissive")
     # Permissive, the default, goes on unsecured without a word where the middleware has no
@@ -55,6 +58,23 @@ def keep_freed_memory() -> None:
     if allocator is not None:
         for option, size in _MALLOC:
             allocator(option, size)
+
+
+@contextmanager
+def security_explained() -> Iterator[None]:
+    """Start rclpy or a node inside this: InputError if security is asked for and not there."""
+    try:
+        yield
+    except (InputError, KeyboardInterrupt):
+        raise
+    except Exception as error:
+        if os.environ.get("ROS_SECURITY_ENABLE", "").lower() != "true":
+            raise
+        raise InputError(
+            "ROS_SECURITY_ENABLE",
+            "true",
+            f"false, unless this ROS 2 has DDS security and the enclave exists ({error})",
+        ) from error
 
 
 class _Interrupt:
@@ -96,19 +116,9 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
     try:
         prepare_environment()
         keep_freed_memory()
-        try:
+        with security_explained():
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
             node = make()
-        except (InputError, KeyboardInterrupt):
-            raise
-        except Exception as error:
-            if os.environ.get("ROS_SECURITY_ENABLE", "").lower() != "true":
-                raise
-            raise InputError(
-                "ROS_SECURITY_ENABLE",
-                "true",
-                f"false, unless this ROS 2 has DDS security and the enclave exists ({error})",
-            ) from error
         install_signal_handlers(SignalHandlerOptions.ALL)
         # What is raised inside a callback of the compiler is swallowed there.
         if not interrupt.received:
