@@ -509,7 +509,7 @@ def test_progress_is_reported(monkeypatch):
     solved, steps, missing = zip(*calls, strict=True)
     assert list(solved) == sorted(solved)
     assert solved[0] == 0
-    assert solved[-1] == 20
+    assert solved[-1] == 32
     assert steps[:3] == (4, 8, 12)
     assert missing[0] > 1e-3
     assert_same_bits(found[0], metastability(mesh, 0.0, math.radians(1.0)))

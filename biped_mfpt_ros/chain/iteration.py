@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from biped_mfpt_ros.chain.lanes import LANES, gather_lanes
 from biped_mfpt_ros.jit import kernel
 
 PLAIN_STEPS = 100
@@ -107,56 +108,19 @@ def outgoing(targets: np.ndarray, slopes: np.ndarray) -> Structure:
 
 @kernel
 def _gather_one(entries, e, end, shift, low, p, x):
-    """What `_gather` does, for a single column."""
-    total = 0.0
-    while e < end:
+    """What `gather_lanes` does, for a single column."""
+    even = 0.0
+    odd = 0.0
+    while e + 1 < end:
         entry = np.uint64(entries[e])
-        s = entry & low
-        if e + 3 < end:
-            second = np.uint64(entries[e + 1])
-            third = np.uint64(entries[e + 2])
-            fourth = np.uint64(entries[e + 3])
-            if (second & low) == s and (third & low) == s and (fourth & low) == s:
-                total += (
-                    (x[entry >> shift, 0] + x[second >> shift, 0])
-                    + (x[third >> shift, 0] + x[fourth >> shift, 0])
-                ) * p[s, 0]
-                e += 4
-                continue
-        total += x[entry >> shift, 0] * p[s, 0]
-        e += 1
-    return total
-
-
-@kernel
-def _gather(entries, e, end, shift, low, p, x, row):
-    """Set `row` to what comes over the entries from `e` to before `end`, in each column.
-
-    All transitions to a state are over the same slope where the mesh is clustered: four at a time.
-    """
-    width = row.shape[0]
-    for c in range(width):
-        row[c] = 0.0
-    while e < end:
+        even += x[entry >> shift, 0] * p[entry & low, 0]
+        entry = np.uint64(entries[e + 1])
+        odd += x[entry >> shift, 0] * p[entry & low, 0]
+        e += 2
+    if e < end:
         entry = np.uint64(entries[e])
-        s = entry & low
-        share = p[s]
-        x1 = x[entry >> shift]
-        if e + 3 < end:
-            second = np.uint64(entries[e + 1])
-            third = np.uint64(entries[e + 2])
-            fourth = np.uint64(entries[e + 3])
-            if (second & low) == s and (third & low) == s and (fourth & low) == s:
-                x2 = x[second >> shift]
-                x3 = x[third >> shift]
-                x4 = x[fourth >> shift]
-                for c in range(width):
-                    row[c] += ((x1[c] + x2[c]) + (x3[c] + x4[c])) * share[c]
-                e += 4
-                continue
-        for c in range(width):
-            row[c] += x1[c] * share[c]
-        e += 1
+        even += x[entry >> shift, 0] * p[entry & low, 0]
+    return even + odd
 
 
 @kernel
@@ -190,7 +154,7 @@ def _advance(starts, entries, bits, p, stay, x, out, total):
         if width == 1:
             row[0] = _gather_one(entries, begin, end, shift, low, p, x)
         else:
-            _gather(entries, begin, end, shift, low, p, x, row)
+            gather_lanes(entries, begin, end, np.int64(bits), p, x, row)
         if end < starts[j + 1]:
             row_lost[:] = 0.0
             while end < starts[j + 1]:
@@ -199,7 +163,7 @@ def _advance(starts, entries, bits, p, stay, x, out, total):
                 if width == 1:
                     piece[0] = _gather_one(entries, begin, end, shift, low, p, x)
                 else:
-                    _gather(entries, begin, end, shift, low, p, x, piece)
+                    gather_lanes(entries, begin, end, np.int64(bits), p, x, piece)
                 _add(row, row_lost, piece)
         for c in range(width):
             row[c] += stay[c] * x[j, c]
@@ -306,6 +270,13 @@ class Settled:
     steps: int
 
 
+def padded(columns: int) -> int:
+    """Width of the arrays of an iteration of so many columns: there is code for 1 and `LANES`."""
+    if columns > LANES:
+        raise ValueError(f"{columns} columns, at most {LANES} are iterated together")
+    return 1 if columns == 1 else LANES
+
+
 OnSteps = Callable[[int, np.ndarray], object]
 
 
@@ -326,12 +297,13 @@ def settle(
     structure : Structure
         `incoming` to step distributions forward, `outgoing` to step functions of the state back.
     probabilities : numpy.ndarray
-        P_S of each column, shape (m, columns).
+        P_S of each column, shape (m, width), width as `padded` says; what is beyond the columns
+        is ignored.
     begin : numpy.ndarray
         State that has all the weight at first, int64, shape (columns,).
     weights, factors : numpy.ndarray
         A component of a vector x of sum 1 that shrinks and is below factor * (weights @ x) does
-        not matter; shapes (n, columns) and (columns,).
+        not matter; shapes (n, width) and (width,).
     tolerance : float
         Most that may be missing of any component that matters, relative to itself.
     most_steps : int
@@ -346,11 +318,13 @@ def settle(
         A step that leaves nothing ends a column with what it started from.
     """
     n, width = weights.shape
+    columns = len(begin)
     vectors = np.zeros((2, n, width))
-    vectors[0, begin, np.arange(width)] = 1.0
+    vectors[0, begin, np.arange(columns)] = 1.0
     found = np.zeros((n, width))
     total, stay = np.ones(width), np.zeros(width)
     passed, done = np.zeros((2, width), dtype=np.bool_)
+    done[columns:] = True
     changes = np.full(width, np.inf)
     seen = np.zeros((n, width))
     at_once = int(_CALL_SECONDS * _OPERATIONS_PER_SECOND / (width * (len(structure.entries) + n)))
@@ -367,7 +341,7 @@ def settle(
     if not done.all():
         left = ~done
         found[:, left] = vectors[k % 2][:, left] / total[left]
-    return Settled(found, done, k)
+    return Settled(found[:, :columns], done[:columns], k)
 
 
 @kernel

@@ -37,6 +37,7 @@ from scipy.sparse import csr_array
 
 from biped_mfpt_ros.chain import iteration
 from biped_mfpt_ros.chain.elimination import eliminated_times, squared_distribution
+from biped_mfpt_ros.chain.lanes import LANES
 from biped_mfpt_ros.chain.mesh import Mesh, check_transitions, checked_array
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
@@ -49,7 +50,6 @@ TOLERANCE = 1e-12
 """Relative accuracy aimed at, in the MFPT and in every state's weight."""
 
 _STEPS = 3000
-_MOST_COLUMNS = 32  # solved together: more would not be faster, and take more memory
 _ASIDE_STEPS = 1000
 # Times in a step's weight that count as visited again and again.
 _OFTEN = 0.1
@@ -334,7 +334,9 @@ class _Solver:
         self.targets = targets
         self.outcomes = outcomes
         self.probabilities = probabilities
-        self.structure = iteration.incoming(targets, np.flatnonzero(probabilities.any(axis=1)))
+        # All slopes, also those without probability, so that sums are in the same order whatever
+        # the columns.
+        self.structure = iteration.incoming(targets, np.arange(targets.shape[1]))
         # Where a slope has no probability at all, others can be reached, or no fall.
         self.slopes = [np.flatnonzero(p) for p in probabilities.T]
         known: dict[bytes, int] = {}
@@ -354,12 +356,13 @@ class _Solver:
         self, columns: np.ndarray, begin: np.ndarray, on_steps: iteration.OnSteps | None
     ) -> iteration.Settled:
         """Iterate the distributions of some columns from some states."""
-        n = len(self.targets)
-        p = np.ascontiguousarray(self.probabilities[:, columns])
-        weights = np.zeros((n, len(columns)))
+        n, width = len(self.targets), iteration.padded(len(columns))
+        p = np.zeros((len(self.probabilities), width))
+        p[:, : len(columns)] = self.probabilities[:, columns]
+        weights = np.zeros((n, width))
         iteration.fall_probabilities(self.targets, p, weights)
-        weights[:, self.safe[columns] > 0] = 1.0
-        factors = np.full(len(columns), TOLERANCE / n)
+        weights[:, np.flatnonzero(self.safe[columns])] = 1.0
+        factors = np.full(width, TOLERANCE / n)
         return iteration.settle(
             self.structure, p, begin, weights, factors, TOLERANCE, _STEPS, on_steps
         )
@@ -502,7 +505,8 @@ def _solve(
     count = probabilities.shape[1]
     work = count * len(solver.structure.entries)
     threads = (threads or os.cpu_count() or 1) if work >= _WORTH_THREADS else 1
-    blocks = np.array_split(np.arange(count), max(-(-count // _MOST_COLUMNS), min(threads, count)))
+    # A few are faster one to a thread.
+    blocks = np.array_split(np.arange(count), count if count <= threads else -(-count // LANES))
     solved, stopped = 0, False
 
     def on_steps(steps: int, missing: np.ndarray) -> None:
