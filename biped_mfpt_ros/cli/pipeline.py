@@ -22,6 +22,7 @@ from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.processes import Child, Processes
 from biped_mfpt_ros.cli.results import estimate_row, mfpt_table, monte_carlo_result
+from biped_mfpt_ros.cli.shared_memory import remove_left_segments
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.files import whole_file
@@ -78,6 +79,7 @@ def run(args: argparse.Namespace) -> None:
     }
     picture = directory / "mfpt.png"
     with Progress(quiet=args.quiet) as progress, Processes(directory / "logs") as processes:
+        remove_left_segments()
         compile_all(progress.say)
         progress.say(f"running in {directory}, ROS namespace {namespace}")
         pipeline = Pipeline(processes, progress, namespace)

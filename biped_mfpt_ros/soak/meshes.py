@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import tempfile
 import time
@@ -104,9 +105,9 @@ def _look(child: Child) -> dict[str, int]:
 
 
 def _shared_memory(child: Child) -> set[str]:
-    """Files of Fast DDS in shared memory that a process has mapped."""
+    """Segments of Fast DDS that a process has mapped, without those that belong to ports."""
     maps = Path("/proc", str(child.process.pid), "maps").read_text()
-    return {word for word in maps.split() if word.startswith("/dev/shm/fastdds_")}
+    return {word for word in maps.split() if re.fullmatch(r"/dev/shm/fastdds_[0-9a-f]+", word)}
 
 
 def _judged(
