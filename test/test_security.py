@@ -90,7 +90,10 @@ def test_policies_allow_what_the_nodes_have_and_nothing_else(tmp_path):
             run = Client("/", lambda: None)
         try:
             wait_for(lambda: mesher.simulators.found(), "the mesher to find the simulator")
-            wait_for(lambda: len(node._recordings) == len(recorder.TOPICS) + 1, "the recorder to find the topics")
+            wait_for(
+                lambda: len(node._recordings) == len(recorder.TOPICS) + 1,
+                "the recorder to find the topics",
+            )
             names = {"simulator": simulator.get_name()}
             everyone = {names.get(name, name) for name in (*NODES, "run")}
             wait_for(lambda: everyone <= set(run._node.get_node_names()), "all to see each other")
