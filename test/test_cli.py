@@ -650,12 +650,34 @@ class TestRun:
     def test_a_node_that_dies_ends_the_run_with_its_log(self, tmp_path):
         run = Run(tmp_path, *LONG)
         run.wait_for_mesh()
-        os.kill(run.nodes()["mesher"][0], signal.SIGKILL)
+        os.kill(run.nodes()["analysis"][0], signal.SIGKILL)
         code, _, err = run.end()
         assert code == 1
-        assert "mesher was killed by SIGKILL; the end of run/logs/mesher.log:" in err
-        assert "ready" in err.partition("mesher.log:")[2]
+        assert "analysis was killed by SIGKILL; the end of run/logs/analysis.log:" in err
+        assert "ready" in err.partition("analysis.log:")[2]
         assert run.nodes() == {}
+        assert not (tmp_path / "run" / "checkpoint").exists()
+
+    def test_a_mesher_that_is_killed_is_replaced_and_the_mesh_goes_on(self, tmp_path, capsys):
+        arguments = ("--threshold", "0.003", "--sigma", "2")
+        more = ("--workers", "1", "--walks", "0", "--json", "--output", "run")
+        run = Run(tmp_path, *arguments, *more)
+        kept = tmp_path / "run" / "checkpoint"
+        wait_until(
+            lambda: any(path.stat().st_size > 20_000 for path in kept.glob("*.journal")),
+            run,
+            "the mesh to grow",
+        )
+        os.kill(run.nodes()["mesher"][0], signal.SIGKILL)
+        code, out, err = run.end(120.0)
+        assert code == 0, err
+        assert "starting another one, which goes on where it was" in err
+        result = json.loads(out)
+        assert 0 < result["swings_resumed"] == result["states"] - 1 - result["swings"]
+        alone = run_json(capsys, "mfpt", "--controller", "hzd/cot", *arguments)
+        assert result["states"] == alone["states"]
+        assert result["estimates"] == alone["estimates"]
+        assert not kept.exists()
 
     @pytest.mark.slow
     def test_runs_side_by_side_do_not_mix(self, tmp_path, capsys):

@@ -11,7 +11,7 @@ import pytest
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.report.progress import Progress
 from biped_mfpt_ros.soak import __main__ as soak
-from biped_mfpt_ros.soak import fuzz, targets
+from biped_mfpt_ros.soak import fuzz, simulators, targets
 
 QUIET = Progress(quiet=True)
 
@@ -74,3 +74,11 @@ def test_soak_prints_a_table_or_json_and_fails_with_what_failed(capsys, monkeypa
     assert result["rows"][0]["count"] == 7
     assert soak.main(["--short", "--only", "fuzz"]) == 1
     assert "FAILED fuzz, buggy: input 0" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_meshes_among_faults_are_those_without():
+    (row,) = simulators.run(True, 1, QUIET)
+    assert row.count >= 8
+    assert row.failures == 0, row.examples
+    assert row.facts["meshes"] > 0

@@ -10,11 +10,17 @@ import argparse
 import json
 import sys
 
-from biped_mfpt_ros.bench import chain, mesh, step_map
+from biped_mfpt_ros.bench import chain, mesh, pipeline, start, step_map
 from biped_mfpt_ros.bench.measure import BenchError
 from biped_mfpt_ros.report.tables import table
 
-SECTIONS = {"step map": step_map.run, "mesh": mesh.run, "chain": chain.run}
+SECTIONS = {
+    "step map": step_map.run,
+    "mesh": mesh.run,
+    "chain": chain.run,
+    "pipeline": pipeline.run,
+    "start": start.run,
+}
 
 
 def main(arguments: list[str] | None = None) -> int:

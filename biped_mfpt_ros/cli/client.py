@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 from biped_mfpt_ros.nodes.spin import security_explained
 
 _POLL = 0.05  # s
+_RESEND = 5.0  # s without an answer, after which a goal is sent again
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,10 @@ class Client:
             recorder=any(info.node_name.startswith("recorder") for info in recorders),
         )
 
+    def sees(self, node: str) -> bool:
+        """Whether a node is there."""
+        return node in self._node.get_node_names()
+
     def listens(self, node: str, topics: Sequence[str]) -> bool:
         """Whether a node of the pipeline is subscribed to all of some topics."""
         return all(
@@ -161,11 +167,15 @@ class Client:
             If the mesher refuses, or the mesh fails.
         """
         goal = GrowMesh.Goal(settings=settings_message(settings))
-        handle = self._result(
-            self._grow.send_goal_async(
-                goal, feedback_callback=lambda message: feedback(message.feedback.progress)
+        handle = None
+        # A mesher that was killed stays on the graph for a while: a goal that went to it is lost.
+        while handle is None:
+            handle = self._result(
+                self._grow.send_goal_async(
+                    goal, feedback_callback=lambda message: feedback(message.feedback.progress)
+                ),
+                _RESEND,
             )
-        )
         if not handle.accepted:
             raise CommandError("the mesher refused the mesh; its log says why")
         result: GrowMesh.Result = self._result(handle.get_result_async()).result
@@ -208,10 +218,12 @@ class Client:
             raise AnalysisFailed(f"the analysis failed: {response.message}")
         return list(response.estimates)
 
-    def _result(self, future: Future) -> Any:
-        while not future.done():
+    def _result(self, future: Future, timeout: float = math.inf) -> Any:
+        """The result of a future; None if it has none after ``timeout`` seconds."""
+        deadline = time.monotonic() + timeout
+        while not future.done() and time.monotonic() < deadline:
             self._spin()
-        return future.result()
+        return future.result() if future.done() else None
 
     def _spin(self) -> None:
         self._executor.spin_once(timeout_sec=_POLL)

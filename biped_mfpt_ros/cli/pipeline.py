@@ -6,9 +6,11 @@ import argparse
 import math
 import os
 import re
+import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -36,6 +38,7 @@ from biped_mfpt_ros.walker.robot import WalkerModel
 START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
 RESULT_TIMEOUT = 120.0  # s, for the analysis to solve the chain
 _MOST_SWINGS = 100_000  # of a Monte Carlo: half a minute or so
+_MOST_MESHERS = 4  # started in a run: where one after the other is killed, there is a reason
 _CURVE_POINTS = 40
 _PICTURE_STEPS = 6
 
@@ -78,13 +81,17 @@ def run(args: argparse.Namespace) -> None:
         "mu_s": mean,
     }
     picture = directory / "mfpt.png"
-    with Progress(quiet=args.quiet) as progress, Processes(directory / "logs") as processes:
+    with (
+        _removed(directory / "checkpoint") as checkpoint,
+        Progress(quiet=args.quiet) as progress,
+        Processes(directory / "logs") as processes,
+    ):
         remove_left_segments()
         compile_all(progress.say)
         progress.say(f"running in {directory}, ROS namespace {namespace}")
         pipeline = Pipeline(processes, progress, namespace)
         recorder = pipeline.record(directory / "bag", on_error=args.on_record_error)
-        pipeline.start(workers, args.mean, args.sigma)
+        pipeline.start(workers, args.mean, args.sigma, checkpoint=checkpoint)
         result |= pipeline.mesh(settings, mean, dict(zip(sigmas, args.sigma, strict=True)))
         # The walks can have all cores, and the bag is closed whatever happens to them.
         progress.show("stopping the nodes")
@@ -116,6 +123,15 @@ def run(args: argparse.Namespace) -> None:
         raise disk
     with whole_file(directory / "result.json") as file:
         file.write(f"{text}\n".encode())
+
+
+@contextmanager
+def _removed(path: Path) -> Iterator[Path]:
+    """Remove a directory at the end, if it has been made."""
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _namespace(name: str) -> str:
@@ -150,6 +166,10 @@ def quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
+class _MesherKilled(Exception):
+    """The mesher was killed, and another one may go on with its mesh."""
+
+
 class Pipeline:
     """The nodes of a run, as processes of their own, and what is asked of them.
 
@@ -168,6 +188,9 @@ class Pipeline:
         self._progress = progress
         self.namespace = namespace
         self._simulators: set[str] = set()
+        self._meshers = 0
+        self._mesher_parameters: dict[str, object] = {}
+        self._survives = False
 
     def record(self, bag: Path, *, on_error: str = "stop") -> Child:
         """Start a recorder.
@@ -180,10 +203,20 @@ class Pipeline:
         return self._node("recorder", "recorder", last=True, bag=text, on_error=on_error)
 
     def start(
-        self, workers: int, mean_deg: float, sigma_deg: Sequence[float], meshes_at_once: int = 4
+        self,
+        workers: int,
+        mean_deg: float,
+        sigma_deg: Sequence[float],
+        meshes_at_once: int = 4,
+        checkpoint: Path | None = None,
     ) -> None:
-        """Start all other nodes."""
-        self._node("mesher", "mesher", meshes_at_once=meshes_at_once)
+        """Start all other nodes. With ``checkpoint``, the mesh survives the mesher."""
+        self._mesher_parameters["meshes_at_once"] = meshes_at_once
+        if checkpoint is not None:
+            self._survives = True
+            path = quoted(str(checkpoint.absolute()))
+            self._mesher_parameters["checkpoint_directory"] = path
+        self._start_mesher()
         # A mesh may be asked for while the next ones come in.
         self._node(
             "analysis",
@@ -196,12 +229,21 @@ class Pipeline:
         for name in sorted(self._simulators):
             self._node(name, "simulator")
 
+    def _start_mesher(self) -> str:
+        """Start a mesher, and return the name of its node."""
+        self._meshers += 1
+        name = "mesher" if self._meshers == 1 else f"mesher_{self._meshers}"
+        self._node(name, "mesher", **self._mesher_parameters)
+        return name
+
     def _node(self, name: str, executable: str, last: bool = False, **parameters: object) -> Child:
         command = [sys.executable, "-m", "biped_mfpt_ros.cli", "node", executable]
         command[-1:-1] = ["--end-with", str(os.getpid())]
         # The log's topic is the same for all nodes on the graph, if it is not brought in here.
         command += ["--ros-args", "-r", f"__ns:={self.namespace}", "-r", "/rosout:=rosout"]
         command += ["--disable-external-lib-logs"]
+        if executable == "mesher":  # there may be another one after it
+            command += ["-r", f"__node:={name}"]
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         environment = os.environ | {"RCUTILS_COLORIZED_OUTPUT": "0", "PYTHONUNBUFFERED": "1"}
@@ -226,7 +268,13 @@ class Pipeline:
                     )
                 )
 
-            grown = client.grow_mesh(settings, feedback)
+            while True:
+                try:
+                    grown = client.grow_mesh(settings, feedback)
+                    break
+                except _MesherKilled:
+                    name = self._start_mesher()
+                    client.wait(lambda name=name: client.sees(name), START_TIMEOUT, name)
             self._progress.show("waiting for the analysis")
             estimates = client.published_mfpt(grown.mesh_id, mean, list(sigmas), RESULT_TIMEOUT)
             low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)
@@ -240,6 +288,7 @@ class Pipeline:
                 "states": grown.states,
                 "generations": grown.generations,
                 "swings": grown.swings,
+                "swings_resumed": grown.swings_resumed,
                 "chunks_repeated": grown.chunks_repeated,
                 "seconds": grown.seconds,
                 "step_map_seconds": grown.step_map_seconds,
@@ -262,6 +311,11 @@ class Pipeline:
         for child in self._processes.newly_ended():
             self._simulators.discard(child.name)
             message = _last_words(child)
+            killed = (child.process.returncode or 0) < 0
+            again = self._survives and self._meshers < _MOST_MESHERS
+            if child.name.startswith("mesher") and killed and again:
+                self._progress.say(f"{message}\nstarting another one, which goes on where it was")
+                raise _MesherKilled
             if not child.name.startswith("simulator") or not self._simulators:
                 raise CommandError(message)
             self._progress.say(f"{message}\ngoing on with {len(self._simulators)} simulator(s)")

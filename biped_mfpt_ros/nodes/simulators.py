@@ -22,7 +22,7 @@ SERVICE_TYPE = "biped_mfpt_msgs/srv/SimulateSteps"
 _LOOK_PERIOD = 0.2  # s, between two looks at the graph
 
 
-class _Aside(CallbackGroup):
+class Aside(CallbackGroup):
     """What is in here is left alone by the executor."""
 
     def can_execute(self, entity: Any) -> bool:
@@ -55,7 +55,7 @@ class GraphSimulators:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._group = _Aside()
+        self._group = Aside()
         self._woken = GuardCondition(None, None, context=node.context)
         self._clients: dict[str, Client[Any, Any]] = {}
         self._ready: frozenset[str] = frozenset()

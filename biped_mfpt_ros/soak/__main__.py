@@ -16,7 +16,7 @@ from biped_mfpt_ros.report.progress import Progress
 from biped_mfpt_ros.report.tables import table
 from biped_mfpt_ros.soak.result import Row
 
-SUBJECTS = ("fuzz", "meshes")
+SUBJECTS = ("fuzz", "meshes", "simulators")
 """Modules of this package, each with a function `run`."""
 
 Run = Callable[[bool, int, Progress], list[Row]]
