@@ -10,7 +10,7 @@ import argparse
 import json
 import sys
 
-from biped_mfpt_ros.bench import chain, mesh, pipeline, start, step_map
+from biped_mfpt_ros.bench import chain, large, mesh, pipeline, scale, start, step_map
 from biped_mfpt_ros.bench.measure import BenchError
 from biped_mfpt_ros.report.tables import table
 
@@ -20,7 +20,11 @@ SECTIONS = {
     "chain": chain.run,
     "pipeline": pipeline.run,
     "start": start.run,
+    "large": large.run,
+    "scale": scale.run,
 }
+ONLY_BY_NAME = ("large", "scale")
+"""Sections that take minutes, and so run when they are named only."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -31,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", choices=[*SECTIONS], nargs="+", help="run these sections alone")
     args = parser.parse_args(arguments)
     found = {}
-    for name in args.only or SECTIONS:
+    for name in args.only or [name for name in SECTIONS if name not in ONLY_BY_NAME]:
         print(f"make bench: {name} ...", file=sys.stderr, flush=True)
         try:
             found[name] = SECTIONS[name](args.short)

@@ -12,14 +12,13 @@ from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from biped_mfpt_msgs import msg
 from biped_mfpt_msgs.srv import SimulateSteps
 from builtin_interfaces.msg import Time
 
-from biped_mfpt_ros.chain.markov import Metastability
 from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES, SCALE_REFRESHES, Mesh
 from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
@@ -27,6 +26,9 @@ from biped_mfpt_ros.gait.step import Steps, check_states
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import check_slopes
+
+if TYPE_CHECKING:  # a simulator needs no chain, and importing it takes a fifth of its start
+    from biped_mfpt_ros.chain.markov import Metastability
 
 MESSAGE_BYTES = 1_000_000
 """Size at which published arrays are split: larger messages cost more time a byte."""
