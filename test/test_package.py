@@ -20,6 +20,7 @@ ROSDEP_KEYS = {
     "PIL": "python3-pil",
     "cmaes": "cmaes",
     "hypothesis": "python3-hypothesis",
+    "llvmlite": "python3-numba",  # which cannot be without it
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
     "mpmath": "python3-sympy",
@@ -33,7 +34,7 @@ ROSDEP_KEYS = {
     "zstandard": "mcap-ros2-support",
 }
 """Of what is on the Python package index. mcap, zstandard, mpmath: the key that brings them."""
-PIP_NAMES = {"PIL": "pillow", "yaml": "pyyaml"}
+PIP_NAMES = {"PIL": "pillow", "llvmlite": "numba", "yaml": "pyyaml"}
 """Import name to name on the package index, where they differ."""
 
 ENTRY_POINTS = importlib.metadata.distribution(PACKAGE).entry_points.select(group="console_scripts")
