@@ -1,0 +1,176 @@
+"""`biped-mfpt optimise` and `biped-mfpt study`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from biped_mfpt_ros.cli import main
+from biped_mfpt_ros.optimise.store import Store
+from biped_mfpt_ros.optimise.study import Study
+
+# A coarse mesh without a check: some milliseconds for a trial.
+QUICK = ("--controller", "hzd/mfpt", "--mesh", "1:1", "--check-walks", "0", "--seed", "2",
+         "--step", "0.5", "--local", "--quiet")  # fmt: skip
+
+
+def outline(path, name="s"):
+    store = Store(Path(path))
+    found = [
+        (t.number, t.vector.tobytes(), t.found.stage, t.found.score, t.found.values)
+        for t in Study(store, name).trials()
+        if t.found is not None
+    ]
+    store.close()
+    return found
+
+
+def optimise(path, *more, name="s"):
+    return main(["optimise", *QUICK, "--store", str(path), "--study", name, *more])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "studies.sqlite"
+    assert optimise(path, "--trials", "20", "--workers", "2") == 0
+    more = ("--objective", "mfpt", "cot=20", "--searcher", "nsga2", "--population", "8")
+    assert optimise(path, "--trials", "20", *more, name="front") == 0
+    return path
+
+
+def result_of(capsys, *arguments):
+    assert main([*arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_result_is_told(finished, capsys):
+    # The study is done, so that nothing is left to do but to tell.
+    assert optimise(finished, "--trials", "20", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["ended"], result["trials"]) == ("trials", 20)
+    best = max(t[3] for t in outline(finished))
+    assert result["best"]["score"] == best
+    assert result["best"]["stage"] == "confirmed"
+    assert optimise(finished, "--trials", "20") == 0
+    text = capsys.readouterr().out
+    assert "study s: 20 trials" in text
+    assert "outside of the step map" in text
+
+
+def test_list_and_show(finished, capsys):
+    rows = result_of(capsys, "study", "list", "--store", str(finished))["studies"]
+    assert [(row["study"], row["trials"]) for row in rows] == [("s", 20), ("front", 20)]
+    shown = result_of(capsys, "study", "show", "s", "--store", str(finished))
+    assert [c["name"] for c in shown["space"]][:3] == ["kp", "kd", "alpha_2^1"]
+    assert [t["score"] for t in shown["trials"][:20]] == [t[3] for t in outline(finished)]
+    assert main(["study", "show", "s", "--store", str(finished)]) == 0
+    assert "parameters of trial" in capsys.readouterr().out
+
+
+def test_what_is_exported_walks(finished, capsys, tmp_path):
+    file = tmp_path / "best.json"
+    store = ("--store", str(finished))
+    assert main(["study", "export", "s", *store, "--output", str(file)]) == 0
+    capsys.readouterr()
+    exported = json.loads(file.read_text())
+    assert exported["scheme"] == "hzd"
+    assert exported["catalogue"]["kp"] == exported["parameters"][0]
+    assert len(exported["catalogue"]["bezier"]) == 4
+    cycle = result_of(capsys, "cycle", "--controller-file", str(file), "--quiet")
+    assert cycle["controller"] == exported["name"]
+    assert cycle["cost_of_transport"] == pytest.approx(exported["found"]["values"]["cot"], rel=1e-4)
+    first = result_of(capsys, "study", "export", "s", *store, "--trial", "0")
+    assert first["trial"] == 0
+    file.write_text("{}")
+    assert main(["cycle", "--controller-file", str(file)]) == 2
+    assert "--controller-file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["plot", "front"])
+def test_pictures(finished, capsys, tmp_path, what, monkeypatch):
+    from biped_mfpt_ros.report import studies
+
+    monkeypatch.setattr(studies, "paper_points", lambda settings: {"hzd/base": (5.8, 0.19)})
+    file = tmp_path / "picture.png"
+    command = ["study", what, "front", "--store", str(finished), "--output", str(file)]
+    assert main(command) == 0
+    assert file.read_bytes().startswith(b"\x89PNG")
+    assert "confirmed" in capsys.readouterr().out
+    assert main(command) == 2  # a file that is there is not written over
+
+
+@pytest.mark.slow
+def test_the_papers_controllers_are_where_the_paper_has_them(finished):
+    from biped_mfpt_ros.control.controller import controller
+    from biped_mfpt_ros.optimise.settings import StudySettings
+    from biped_mfpt_ros.report.studies import paper_points
+
+    points = paper_points(StudySettings(controller("hzd/mfpt")))
+    assert set(points) >= {"hzd/base", "hzd/cot", "hzd/mfpt", "smc/base", "smc/mfpt"}
+    assert points["hzd/base"][1] == pytest.approx(0.1865, rel=2e-3)
+    assert points["hzd/mfpt"][0] == pytest.approx(136.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["--searcher", "luck"], "--searcher: 'luck'"),
+        (["--objective", "mfpt", "beauty"], "objectives: 'beauty'"),
+        (["--limit", "speed_min=x"], "'speed_min=x' is not allowed"),
+        (["--limit", "weight_max=3"], "limits: 'weight_max'"),
+        (["--fix", "omega"], "omega"),
+        (["--sigma", "0"], "--sigma: 0.0"),
+        (["--mesh", "1"], "'1' is not allowed"),
+        (["--mesh", "0.3:1"], "0.3"),
+        (["--trials", "0"], "--trials: 0"),
+        (["--workers", "0"], "--workers: 0"),
+        (["--check-walks", "-1"], "--check-walks: -1"),
+    ],
+)
+def test_bad_options_are_refused(tmp_path, capsys, arguments, problem):
+    assert optimise(tmp_path / "s.sqlite", *arguments) == 2
+    assert problem in capsys.readouterr().err
+
+
+def test_what_is_not_there_is_told(finished, tmp_path, capsys):
+    assert main(["study", "list", "--store", str(tmp_path / "none")]) == 2
+    assert main(["study", "show", "none", "--store", str(finished)]) == 2
+    assert "one of those in" in capsys.readouterr().err
+    assert main(["study", "show", "--store", str(finished)]) == 2
+    assert optimise(finished, "--trials", "20", "--fix", "kp") == 2
+    assert "now different: fixed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_study_that_was_killed_goes_on(tmp_path, number):
+    path = tmp_path / "killed.sqlite"
+    command = [sys.executable, "-m", "biped_mfpt_ros.cli", "optimise", *QUICK,
+               "--store", str(path), "--study", "s", "--trials", "60"]  # fmt: skip
+    process = subprocess.Popen(command, env=dict(os.environ))
+    deadline = time.monotonic() + 200.0
+    while not path.exists() or len(outline_so_far(path)) < 8:
+        assert time.monotonic() < deadline
+        assert process.poll() is None, "it was done before it could be stopped"
+        time.sleep(0.02)
+    process.send_signal(number)
+    process.wait()
+    before = outline(path)
+    assert len(before) < 60
+    assert optimise(path, "--trials", "60") == 0
+    after = outline(path)
+    assert after[: len(before)] == before or set(map(str, before)) <= set(map(str, after))
+    assert optimise(tmp_path / "whole.sqlite", "--trials", "60", "--workers", "1") == 0
+    assert after == outline(tmp_path / "whole.sqlite")
+
+
+def outline_so_far(path):
+    store = Store(path)
+    try:
+        return outline(path) if store.names() else []
+    finally:
+        store.close()
