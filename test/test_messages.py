@@ -387,6 +387,20 @@ def test_a_message_that_comes_again_is_noticed(assembly_cases):
     assert "came twice" in assembly.problem
 
 
+def test_a_mesh_that_was_handed_out_stays_as_it_is(assembly_cases):
+    mesh, topics = assembly_cases
+    assembly = MeshAssembly("m")
+    for add, topic in zip(ADD, topics, strict=True):
+        for message in topic:
+            add(assembly, message)
+    got = assembly.mesh()
+    more = sent(topics[1][-1])
+    more.first_index = STATES
+    assembly.add_states(more)
+    assert assembly.mesh() is got
+    assert same_bits(got.states, mesh.states)
+
+
 def test_messages_that_overlap_are_noticed(assembly_cases):
     _, (infos, states, _) = assembly_cases
     assembly = MeshAssembly("m")

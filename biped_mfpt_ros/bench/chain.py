@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 import os
 import time
-import tracemalloc
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from biped_mfpt_msgs.msg import MeshInfo
@@ -129,14 +129,20 @@ def check_chain(found: list[Metastability], sigmas: np.ndarray) -> float:
     return error
 
 
+def _resident(field: str) -> int:
+    """Bytes that this process holds (VmRSS) or held at most (VmHWM), from the kernel."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field):
+            return int(line.split()[1]) * 1024
+    raise BenchError(f"/proc/self/status says nothing of {field}")
+
+
 def peak_of(work: Callable[[], object]) -> int:
-    """Most bytes that were allocated during some work, beyond what was before."""
-    tracemalloc.start()
-    try:
-        work()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    """Most bytes of memory that some work took, beyond what was held before."""
+    Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins anew
+    before = _resident("VmRSS")
+    work()
+    return max(0, _resident("VmHWM") - before)
 
 
 def chain(states: int, sigmas: np.ndarray, section: Section) -> None:
@@ -207,7 +213,7 @@ def refined(mesh: Mesh, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         scaled = mesh.states[own] / mesh.scales
         _, found = cKDTree(scaled).query(scaled, min(4, len(own)))
         near[own] = own[np.resize(found.reshape(len(own), -1).T, (4, len(own))).T]
-    picked = rng.integers(1, len(mesh.states), count)
+    picked = np.sort(rng.integers(1, len(mesh.states), count))  # in the order of the mesh
     weights = rng.dirichlet(np.ones(4), count)
     states = np.einsum("nk,nkd->nd", weights, mesh.states[near[picked]])
     return states, mesh.preceding[picked]

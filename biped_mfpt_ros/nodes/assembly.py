@@ -19,34 +19,45 @@ class IncompleteMesh(LookupError):
 
 
 class _Pieces:
-    """Arrays that follow one another by index, from 1 on, in whichever order they come.
+    """Arrays that are put together by index, in whichever order their pieces come.
+
+    What comes in order is copied at once, so that memory never holds all of it twice.
 
     Parameters
     ----------
     topic : str
         Where they come from, for messages.
+    first : numpy.ndarray
+        Row 0 of each of the arrays.
     """
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, *first: np.ndarray) -> None:
         self.count = 1
         self._topic = topic
-        self._ready: list[tuple[np.ndarray, ...]] = []
+        self._arrays = [np.array([row]) for row in first]
         self._early: dict[int, tuple[np.ndarray, ...]] = {}
 
-    def add(self, first: int, arrays: tuple[np.ndarray, ...]) -> str:
-        """Take arrays of equal length whose first row has index `first`; returns what is wrong."""
+    def add(self, first: int, pieces: tuple[np.ndarray, ...]) -> str:
+        """Take pieces of equal length whose first row has index `first`; returns what is wrong."""
         if first == 0:
             return f"{self._topic}: index 0, the failure state, which is never published"
         if first < self.count or first in self._early:
             return f"{self._topic}: index {first} came twice"
-        if len(arrays[0]):
-            self._early[first] = arrays
+        if len(pieces[0]):
+            self._early[first] = pieces
         while self.count in self._early:
-            self._ready.append(self._early.pop(self.count))
-            self.count += len(self._ready[-1][0])
+            self._append(self._early.pop(self.count))
         if self._early and min(self._early) < self.count:
             return f"{self._topic}: index {min(self._early)} came twice"
         return ""
+
+    def _append(self, pieces: tuple[np.ndarray, ...]) -> None:
+        end = self.count + len(pieces[0])
+        for array, piece in zip(self._arrays, pieces, strict=True):
+            if end > len(array):  # in place: large arrays are moved by the kernel, not copied
+                array.resize((end + end // 8, *array.shape[1:]), refcheck=False)
+            array[self.count : end] = piece
+        self.count = end
 
     def missing(self) -> str:
         """Where there is a gap, in words; empty if there is none."""
@@ -56,22 +67,11 @@ class _Pieces:
             f"{self._topic}: from index {self.count} to before {min(self._early)} nothing has come"
         )
 
-    def joined(self, *first: np.ndarray) -> list[np.ndarray]:
-        """Row 0 and all that came, one array for each; may be called once.
-
-        Pieces are let go as they are copied, so that memory never holds all of it twice.
-        """
-        out = [np.empty((self.count, *row.shape), row.dtype) for row in first]
-        for whole, row in zip(out, first, strict=True):
-            whole[0] = row
-        at = 1
-        self._ready.reverse()
-        while self._ready:
-            arrays = self._ready.pop()
-            for whole, piece in zip(out, arrays, strict=True):
-                whole[at : at + len(piece)] = piece
-            at += len(arrays[0])
-        return out
+    def joined(self) -> list[np.ndarray]:
+        """The arrays, row 0 and all that came."""
+        for array in self._arrays:
+            array.resize((self.count, *array.shape[1:]), refcheck=False)
+        return self._arrays
 
 
 class MeshAssembly:
@@ -110,9 +110,7 @@ class MeshAssembly:
         self.status: int | None = None
         self.problem = ""
         self._final: Any = None
-        self._early: list[tuple[Callable[[Any], None], Any]] = []
-        self._states = _Pieces("mesh/states")
-        self._rows = _Pieces("mesh/transitions")
+        self._forget()
         self._mesh: Mesh | None = None
 
     @property
@@ -160,6 +158,9 @@ class MeshAssembly:
                 self._spoil(f"mesh/info: {error}")
                 return
             self.step_map = message.step_map
+            m = len(self.settings.slopes)
+            fallen = np.zeros(m, np.uint32), np.full(m, NOT_SIMULATED, np.uint8)
+            self._rows = _Pieces("mesh/transitions", *fallen)
             early, self._early = self._early, []
             for take, other in early:
                 self._take(take, other)
@@ -195,13 +196,8 @@ class MeshAssembly:
 
     def _joined(self) -> Mesh:
         assert self.settings is not None
-        m = len(self.settings.slopes)
-        states, preceding, generation = self._states.joined(
-            np.zeros(STATE_SIZE), np.uint32(0), np.uint32(0)
-        )
-        targets, outcomes = self._rows.joined(
-            np.zeros(m, np.uint32), np.full(m, NOT_SIMULATED, np.uint8)
-        )
+        states, preceding, generation = self._states.joined()
+        targets, outcomes = self._rows.joined()
         return Mesh(
             slopes=self.settings.slopes,
             states=states,
@@ -217,13 +213,19 @@ class MeshAssembly:
     def _spoil(self, problem: str) -> None:
         """Give the mesh up, and the memory of what has come of it."""
         self.problem = problem
-        self._early = []
-        self._states, self._rows = _Pieces("mesh/states"), _Pieces("mesh/transitions")
+        self._forget()
+
+    def _forget(self) -> None:
+        self._early: list[tuple[Callable[[Any], None], Any]] = []
+        zero = np.uint32(0)
+        self._states = _Pieces("mesh/states", np.zeros(STATE_SIZE), zero, zero)
+        self._rows = _Pieces("mesh/transitions")
 
     def _take(self, take: Callable[[Any], None], message: Any) -> None:
-        # Without the slope set nothing can be checked.
-        if self.problem:
+        # The arrays of a mesh that was handed out are not touched any more.
+        if self.problem or self._mesh is not None:
             return
+        # Without the slope set nothing can be checked.
         if self.settings is None:
             self._early.append((take, message))
         else:
