@@ -191,6 +191,81 @@ def store(context, array, row, i, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def splat(context, number):  # type: ignore[no-untyped-def]
+    """A number in every lane."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        return _vector(context, builder, args[0], sig.args[0])
+
+    return _lanes(number), generate
+
+
+@intrinsic
+def lane_of(context, lanes, lane):  # type: ignore[no-untyped-def]
+    """The number in one lane."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        return builder.extract_element(args[0], args[1])
+
+    return types.float64(lanes, lane), generate
+
+
+def _bits(builder: Any, value: Any) -> tuple[Any, Any, Callable[[int], Any]]:
+    """The bits of a number or lanes, their LLVM type, and constants of it."""
+    kind: Any = ir.IntType(64)
+    if value.type == _VECTOR:
+        kind = ir.VectorType(kind, LANES)
+
+    def constant(number: int) -> Any:
+        return ir.Constant(kind, number if value.type != _VECTOR else [number] * LANES)
+
+    return builder.bitcast(value, kind), kind, constant
+
+
+@intrinsic
+def mantissa(context, x):  # type: ignore[no-untyped-def]
+    """``x 2^-binary_exponent(x)``, 0.5 to 1, of a positive number or lanes of them."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        bits, _, constant = _bits(builder, args[0])
+        bits = builder.or_(
+            builder.and_(bits, constant(0x000FFFFFFFFFFFFF)), constant(0x3FE0000000000000)
+        )
+        return builder.bitcast(bits, args[0].type)
+
+    return x(x), generate
+
+
+@intrinsic
+def binary_exponent(context, x):  # type: ignore[no-untyped-def]
+    """Exponent of two of a positive number or lanes of them."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        bits, _, constant = _bits(builder, args[0])
+        biased = builder.lshr(bits, constant(52))
+        # Its bits in those of 2^52 are 2^52 more than it.
+        number = builder.bitcast(builder.or_(biased, constant(0x4330000000000000)), args[0].type)
+        offset = 2.0**52 + 1022.0
+        offsets = ir.Constant(args[0].type, [offset] * LANES if args[0].type == _VECTOR else offset)
+        return builder.fsub(number, offsets)
+
+    return x(x), generate
+
+
+@intrinsic
+def power_of_two(context, x):  # type: ignore[no-untyped-def]
+    """``2^x`` for whole numbers or lanes of them, -1022 to 1023."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        offset = 1.5 * 2.0**52 + 1023.0
+        offsets = ir.Constant(args[0].type, [offset] * LANES if args[0].type == _VECTOR else offset)
+        bits, _, constant = _bits(builder, builder.fadd(args[0], offsets))
+        return builder.bitcast(builder.shl(bits, constant(52)), args[0].type)
+
+    return x(x), generate
+
+
+@intrinsic
 def any_lane(context, mask):  # type: ignore[no-untyped-def]
     """Whether a condition holds in any lane."""
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly, BSpline
 
 from biped_mfpt_ros.control import hzd, smc, spline
@@ -14,6 +15,7 @@ from biped_mfpt_ros.control.controller import Controller, controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.closed_loop import closed_loop
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.gait.scratch import empty_scratch
 from biped_mfpt_ros.gait.trace import trace_swing
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker.robot import ABSOLUTE, WalkerModel, rabbit
@@ -71,7 +73,8 @@ def motion(control, state, switched=False, model=FREE):
     rate, torques = np.empty(11), np.empty(4)
     y = np.append(dynamics.to_absolute(state), 0.0)
     packed = control.packed(model.robot)
-    closed_loop(control.code, switched, model.packed(), packed, y, rate, torques)
+    work = empty_scratch()
+    closed_loop(control.code, switched, model.packed(), packed, work, y, rate, torques)
     return np.linalg.solve(ABSOLUTE, rate[5:10]), torques
 
 
@@ -130,14 +133,56 @@ def test_sliding_mode_near_sigma_zero_rests_on_its_slow_manifold():
     for exponent in (0.4, 0.2, -0.03):
         width = (k / smc.STEEPEST) ** (1 / (1 - exponent))
         for rate in (0.0, 1e-3, 0.5, 5.0):
-            slow = rate / smc.STEEPEST
-            if slow > width:
-                slow = (rate / k) ** (1 / exponent)
+            slow = (rate / k) ** (1 / exponent) if exponent > 0 else rate / smc.STEEPEST
             assert smc._law(slow, rate, k, exponent, width) == pytest.approx(rate, abs=1e-9)
             for sigma in (0.0, 1e-12, 1e-6, 1e-3, 0.1, 3.0):
                 value = smc._law(sigma, rate, k, exponent, width)
                 assert math.isfinite(value)
                 assert smc._law(-sigma, -rate, k, exponent, width) == -value
+
+
+@pytest.mark.parametrize("exponent", [0.4, 0.2])
+def test_an_output_that_slides_settles_as_the_law_of_the_paper_has_it(exponent):
+    """One output by eq. (21) to the letter and a stiff integrator, against the two modes.
+
+    To 3e-6 rad and 3e-5 rad/s: what the bounds on the law's slope may change while it is reached.
+    """
+    k, tau = 50.0, 0.1
+    width = (k / smc.STEEPEST) ** (1 / (1 - exponent))
+    start, end = np.array([0.15, 0.0]), 0.4
+
+    def literal(t, y):
+        sigma = y[1] + y[0] / tau
+        return [y[1], -k * abs(sigma) ** exponent * np.sign(sigma)]
+
+    def reaching(t, y):
+        return [y[1], -smc._law(y[1] + y[0] / tau, y[1] / tau, k, exponent, width)]
+
+    def sliding(t, y):
+        return [y[1], -smc._sliding(y[1] + y[0] / tau, y[1] / tau, 1 / tau, k, exponent)]
+
+    def arrived(t, y):
+        rate = y[1] / tau
+        _, slope = smc._manifold(rate, k, exponent)
+        off = abs(reaching(t, y)[1] + rate) / smc.SLIDING_RATE
+        return max(off / smc.ENTRY, slope * smc.STIFF) - 1.0
+
+    arrived.terminal = True
+    tight = {"rtol": 1e-10, "atol": 1e-12}
+    expected = solve_ivp(literal, (0, end), start, "Radau", **tight).y[:, -1]
+    first = solve_ivp(reaching, (0, end), start, "LSODA", events=arrived, **tight)
+    assert first.status == 1
+    assert first.t[-1] < 0.5 * end  # it slides for most of the time
+    found = solve_ivp(sliding, (first.t[-1], end), first.y[:, -1], "LSODA", **tight).y[:, -1]
+    assert abs(expected[0]) > 1e-3
+    assert np.abs(found - expected)[0] < 3e-6
+    assert np.abs(found - expected)[1] < 3e-5
+
+
+@pytest.mark.parametrize("p", [-0.7, -0.03, 0.2, 0.4, 1.0, 5.0])
+def test_power_agrees_with_the_c_librarys(p):
+    for x in np.exp(RNG.uniform(-30, 30, 200)):
+        assert smc.power(x, p) == pytest.approx(x**p, rel=2e-14 * (1 + abs(p)))
 
 
 def spline_reference(parameters):

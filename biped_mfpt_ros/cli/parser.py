@@ -170,7 +170,7 @@ def _parents() -> dict[str, Parser]:
         "--tolerance",
         type=_number,
         metavar="TOL",
-        help="local error of the integrator, rad and rad/s (default: 3e-9)",
+        help="local error of the integrator, rad and rad/s (default: 2e-8)",
     )
 
     terrain = group("terrain", "terrain")

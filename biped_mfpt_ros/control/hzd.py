@@ -79,8 +79,6 @@ def command(par, a, da):
 @kernel
 def switch(par, a):
     """Positive as long as torques are applied: ``tau_off - tau``."""
-    if par[_OFF] == math.inf:
-        return 1.0
     tau = (-0.5 * (a[0] + a[2]) - par[_THETA_START]) * par[_SLOPE]
     return par[_OFF] - tau
 

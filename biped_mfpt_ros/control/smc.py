@@ -6,17 +6,24 @@ the stance femur passes the vertical (eq. 22), by ``v = -k |sigma|^(2 alpha - 1)
 
 The law near sigma = 0
 ----------------------
-There the exponent below one makes the law infinitely steep, and no explicit integrator can follow
-it, nor is it of interest how fast an output settles that settles at once. So its slope is bounded
-twice, far above the rates of the gait (some 20/s):
+There the exponent below one makes the law infinitely steep. What an output does then is known: it
+rests on the slow manifold ``sigma = S(dh / tau)`` on which the law is ``v = -dh / tau`` to first
+order. So an output has two modes.
 
-- By `STEEPEST` about sigma = 0: below ``(k / STEEPEST)^(1 / (2 - 2 alpha))``, some 1e-5 rad/s, the
-  law is linear. That moves an output by some 1e-6 rad. It also covers 2 alpha - 1 <= 0, outside of
-  what the paper allows but present in its Table 3, where the law jumps at sigma = 0: the output
-  then slides there (Filippov), without the chatter that a literal sign function would leave.
-- By `SLIDING_RATE` about the slow manifold, where an output in sliding mode rests with
-  ``v = -dh / tau``: further off than ``|v + dh / tau| / SLIDING_RATE`` the law is eq. (21) to the
-  letter, closer the output comes to the same manifold within ``1 / SLIDING_RATE``.
+- Reaching, by eq. (21). No explicit integrator can follow it to the end, nor is it of interest how
+  fast an output settles that settles at once. So the law's slope is bounded twice, far above the
+  rates of the gait (some 20/s): by `STEEPEST` about sigma = 0, where the law passes smoothly into a
+  linear one below the width ``(k / STEEPEST)^(1 / (2 - 2 alpha))``, some 5e-4 rad/s; and by
+  `SLIDING_RATE` about the slow manifold: further off than ``|v + dh / tau| / SLIDING_RATE`` the law
+  is eq. (21), closer the output comes to the manifold within ``1 / SLIDING_RATE``.
+- Sliding, from where it has come within `ENTRY` of the manifold and no torque is at its limit, as
+  long as none is, up to the switch of the references. The output stays on the manifold of eq. (21)
+  itself, without the bounds. This also covers 2 alpha - 1 <= 0, outside of what the paper allows
+  but present in its Table 3, where the law jumps at sigma = 0: the output then slides there
+  (Filippov), without the chatter that a literal sign function would leave.
+
+So the bounds matter only while an output crosses sigma = 0 without sliding there. That takes
+milliseconds at most, within which they move it by some 1e-6 rad.
 """
 
 from __future__ import annotations
@@ -27,6 +34,7 @@ import numpy as np
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.lanes import binary_exponent, mantissa, power_of_two, select
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot
 
@@ -55,50 +63,173 @@ PARAMETERS = (
 SLIDING_RATE = 2000.0
 """1/s, the steepest secant of the law about its slow manifold."""
 
-STEEPEST = 5e4
+STEEPEST = 5e3
 """1/s, the steepest secant of the law about sigma = 0."""
+
+ENTRY = 1e-5
+"""rad/s: an output that comes so near to its slow manifold slides."""
+
+DRIFT = 200.0
+"""1/s, at which a sliding output loses what it was off its manifold when it began to slide."""
+
+CLEAR = 0.02
+"""Of the torque limit: how far every torque must be below it for an output to begin to slide. That
+keeps the small change of the torques then from taking it out of the sliding mode at once."""
+
+STIFF = 1000.0
+"""1/s: an output slides where the law about its slow manifold is at least so steep."""
 
 # Offsets into the packed parameters: references before and after the switch, then k, 2 alpha - 1,
 # 1 / tau, and the half width about sigma = 0 where the law is linear.
 _REF1, _REF2, _K, _EXPONENT, _RATE, _WIDTH = 0, 4, 8, 12, 16, 20
 PACKED_SIZE = 24
 
+_ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to an integer
+_SQRT_HALF = math.sqrt(0.5)
+_LOG = tuple(2.0 / math.log(2.0) / n for n in range(1, 22, 2))
+_EXP = tuple(math.log(2.0) ** n / math.factorial(n) for n in range(14))
+
+
+@kernel
+def power(x, p):
+    """``x^p`` for x >= 0, to some 1e-14 relative for results of ordinary size.
+
+    The C library's differs in its last bit from machine to machine, and is not for lanes.
+    """
+    m = mantissa(x)
+    e = binary_exponent(x)
+    low = m < _SQRT_HALF
+    m = select(low, 2.0 * m, m)
+    e = select(low, e - 1.0, e)
+    t = (m - 1.0) / (m + 1.0)
+    z = t * t
+    series = _LOG[10] * z + _LOG[9]
+    for i in range(8, -1, -1):
+        series = series * z + _LOG[i]
+    y = p * (e + t * series)
+    y = select(y < -1000.0, -1000.0, select(y > 1000.0, 1000.0, y))
+    n = (y + _ROUND) - _ROUND
+    f = y - n
+    series = _EXP[13] * f + _EXP[12]
+    for i in range(11, -1, -1):
+        series = series * f + _EXP[i]
+    return series * power_of_two(n)
+
+
+@kernel
+def _with_sign(size, x):
+    return select(x < 0.0, -size, size)
+
+
+@kernel
+def _slow(rate, k, exponent, width):
+    """Where the law is about ``rate``, and whether there is such a sigma."""
+    size = abs(rate)
+    linear = size <= STEEPEST * width
+    if exponent > 0.0:
+        return _with_sign(power(size / k, 1.0 / exponent), rate), size == size
+    # Faster than the law ever is, it does not slide: sigma = 0 is only crossed.
+    return rate / STEEPEST, linear
+
+
+@kernel
+def _manifold(rate, k, exponent):
+    """The slow manifold of eq. (21) to first order: sigma, and its slope over ``rate`` (s)."""
+    if exponent > 0.0:
+        size = abs(rate)
+        sigma = power(size / k, 1.0 / exponent)
+        slope = select(size > 1e-12, sigma / (exponent * size), 0.0)
+        return _with_sign(sigma, rate), slope
+    return 0.0 * rate, 0.0 * rate
+
 
 @kernel
 def _law(sigma, rate, k, exponent, width):
-    """-v of eq. (21) for one output; ``rate`` is dh / tau, ``width`` where the law is linear."""
-    size = abs(sigma)
-    law = sigma * STEEPEST if size < width else math.copysign(k * size**exponent, sigma)
-    if abs(rate) <= STEEPEST * width:
-        slow = rate / STEEPEST
-    elif exponent > 0.0:
-        slow = math.copysign((abs(rate) / k) ** (1.0 / exponent), rate)
-    else:
-        return law  # too fast to slide: sigma = 0 is only crossed
+    """-v of eq. (21) for one output; ``rate`` is dh / tau.
+
+    ``|sigma|`` is smoothed to ``(sigma^4 + width^4)^(1/4)``, so that the law is linear far below
+    the width, and eq. (21) to a few parts of 1e9 at a hundred widths.
+    """
+    size = sigma * sigma
+    size = size * size + width * width * width * width
+    law = k * sigma * power(size, 0.25 * (exponent - 1.0))
+    slow, slides = _slow(rate, k, exponent, width)
     excess = law - rate
     bound = SLIDING_RATE * abs(sigma - slow)
-    if abs(excess) > bound:
-        return rate + math.copysign(bound, excess)
-    return law
+    bounded = (abs(excess) > bound) & slides
+    return select(bounded, rate + _with_sign(bound, excess), law)
 
 
 @kernel
-def _output(par, i, after_switch, value, rate):
-    """Acceleration of one output (eq. 18, 21)."""
-    ref = _REF2 if after_switch else _REF1
+def _sliding(sigma, rate, inverse_tau, k, exponent):
+    """-v of an output that slides.
+
+    On the slow manifold ``sigma = S(rate)``, where ``-v = rate - dS/dt`` and
+    ``d(rate)/dt = v / tau``. To second order in ``g = S' / tau``, of which S itself differs by a
+    factor from where the law is ``rate``.
+    """
+    slow, slope = _manifold(rate, k, exponent)
+    g = slope * inverse_tau
+    if exponent > 0.0:
+        slow = slow * (1.0 + g / exponent)
+        g = g * (1.0 + (2.0 / exponent - 1.0) * g)
+    return rate / (1.0 - g) + DRIFT * (sigma - slow)
+
+
+@kernel
+def _output(par, i, switched, slides, value, rate):
+    """Acceleration of one output (eq. 18, 21); ``switched`` and ``slides`` are 0 or 1."""
     inverse_tau = par[_RATE + i]
-    sigma = rate + (value - par[ref + i]) * inverse_tau
-    return -_law(sigma, rate * inverse_tau, par[_K + i], par[_EXPONENT + i], par[_WIDTH + i])
+    reference = par[_REF1 + i] + switched * (par[_REF2 + i] - par[_REF1 + i])
+    sigma = rate + (value - reference) * inverse_tau
+    k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
+    slow_rate = rate * inverse_tau
+    law = _law(sigma, slow_rate, k, exponent, width)
+    along = _sliding(sigma, slow_rate, inverse_tau, k, exponent)
+    return -select(slides > 0.5, along, law)
 
 
 @kernel
-def command(par, a, da, after_switch):
-    """Accelerations ``alpha + beta z`` of the five links, ``z`` that of the stance femur."""
-    v2 = _output(par, 0, after_switch, a[1], da[1])
-    v3 = _output(par, 1, after_switch, a[2] - a[0], da[2] - da[0])
-    v4 = _output(par, 2, after_switch, a[3] - a[1], da[3] - da[1])
-    v5 = _output(par, 3, after_switch, a[4], da[4])
-    return (0.0, v2, v3, v2 + v4, v5), (1.0, 0.0, 1.0, 0.0, 0.0)
+def command(par, a, da, switched, slides):
+    """Accelerations ``alpha + beta z`` of the five links, ``z`` that of the stance femur.
+
+    ``switched`` is 0 or 1, and so are the four ``slides``: which outputs are in sliding mode.
+    """
+    v2 = _output(par, 0, switched, slides[0], a[1], da[1])
+    v3 = _output(par, 1, switched, slides[1], a[2] - a[0], da[2] - da[0])
+    v4 = _output(par, 2, switched, slides[2], a[3] - a[1], da[3] - da[1])
+    v5 = _output(par, 3, switched, slides[3], a[4], da[4])
+    zero = 0.0 * v2
+    one = zero + 1.0
+    return (zero, v2, v3, v2 + v4, v5), (one, zero, one, zero, zero)
+
+
+@kernel
+def off_slide(par, i, a, da, switched):
+    """How far an output is from where it begins to slide; it does at zero and below.
+
+    If its acceleration is as commanded: no torque is at its limit.
+    """
+    value, rate = a[1], da[1]
+    if i == 1:
+        value, rate = a[2] - a[0], da[2] - da[0]
+    elif i == 2:
+        value, rate = a[3] - a[1], da[3] - da[1]
+    elif i == 3:
+        value, rate = a[4], da[4]
+    inverse_tau = par[_RATE + i]
+    reference = par[_REF2 + i] if switched > 0.5 else par[_REF1 + i]
+    sigma = rate + (value - reference) * inverse_tau
+    slow_rate = rate * inverse_tau
+    k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
+    _, slope = _manifold(slow_rate, k, exponent)
+    g = slope * inverse_tau / exponent if exponent > 0.0 else 0.0
+    _, slides = _slow(slow_rate, k, exponent, width)
+    if not slides:
+        return math.inf
+    law = _law(sigma, slow_rate, k, exponent, width)
+    near = SLIDING_RATE * ENTRY + 2.0 * g * abs(slow_rate)
+    return max(abs(law - slow_rate) / near, slope * STIFF) - 1.0
 
 
 @kernel

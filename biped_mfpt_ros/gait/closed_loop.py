@@ -6,31 +6,35 @@ within a step and takes its change for an event: `motion` is smooth, also beyond
 set should have changed.
 
 A further control scheme is a kernel ``command(par, a, da)`` that returns the accelerations of the
-five links as ``alpha + beta z``, two tuples of five numbers. It takes a line in `_command`, and
-another in `switch` if it has a switch; ``control/controller.py`` gives it a code and a name. A
-scheme without branches and tables may be called with lanes, as hybrid zero dynamics is in
-`lanes_motion`, and is then some three times faster.
+five links as ``alpha + beta z``, two tuples of five. It takes a line in `_command`, and another in
+`switch` if it has a switch; ``control/controller.py`` gives it a code and a name. Written without
+branches and tables it goes through all lanes at once; otherwise lane by lane, as the spline does.
 """
 
 from __future__ import annotations
 
 from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.control.controller import HZD, SMC
-from biped_mfpt_ros.gait.scratch import COMMAND, CUT, MODE, SWITCHED
+from biped_mfpt_ros.gait.scratch import COMMAND, CUT, MODE, SLIDES, SPARE, SWITCHED
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.lanes import LANES, any_lane, load, select
+from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker import robot as r
 
 
 @kernel
-def _command(scheme, par, a, da, switched):
-    """Accelerations ``alpha + beta z`` that the controller wants."""
+def _command(scheme, par, w, row, a, da, switched, slides):
+    """Accelerations ``alpha + beta z`` that the controller wants, for the states in a row."""
     if scheme == HZD:
         return hzd.command(par, a, da)
     if scheme == SMC:
-        return smc.command(par, a, da, switched > 0.5)
-    return spline.command(par, a, da)
+        return smc.command(par, a, da, switched, slides)
+    for lane in range(LANES):
+        alpha, beta = spline.command(par, lane_angles(w, row, lane), lane_rates(w, row, lane))
+        for i in range(5):
+            w[COMMAND, i, lane] = alpha[i]
+            w[COMMAND, 5 + i, lane] = beta[i]
+    return angles(w, COMMAND), rates(w, COMMAND)
 
 
 @kernel
@@ -40,7 +44,31 @@ def switch(scheme, par, a):
         return hzd.switch(par, a)
     if scheme == SMC:
         return smc.switch(par, a)
-    return 1.0
+    return 1.0 + 0.0 * a[0]
+
+
+@kernel
+def angles(w, row):
+    """Five angles in all lanes."""
+    return (load(w, row, 0), load(w, row, 1), load(w, row, 2), load(w, row, 3), load(w, row, 4))
+
+
+@kernel
+def rates(w, row):
+    """Five rates in all lanes."""
+    return (load(w, row, 5), load(w, row, 6), load(w, row, 7), load(w, row, 8), load(w, row, 9))
+
+
+@kernel
+def lane_angles(w, row, lane):
+    """Five angles in one lane."""
+    return (w[row, 0, lane], w[row, 1, lane], w[row, 2, lane], w[row, 3, lane], w[row, 4, lane])
+
+
+@kernel
+def lane_rates(w, row, lane):
+    """Five rates in one lane."""
+    return (w[row, 5, lane], w[row, 6, lane], w[row, 7, lane], w[row, 8, lane], w[row, 9, lane])
 
 
 @kernel
@@ -85,7 +113,47 @@ def _off(scheme, switched):
 
 
 @kernel
-def motion(scheme, rob, par, cut, switched, a, da):
+def mode_of_all(w):
+    """Of all lanes: torques cut off, whether the controller has switched, which outputs slide."""
+    return (
+        (
+            load(w, MODE, CUT),
+            load(w, MODE, CUT + 1),
+            load(w, MODE, CUT + 2),
+            load(w, MODE, CUT + 3),
+        ),
+        load(w, MODE, SWITCHED),
+        (
+            load(w, MODE, SLIDES),
+            load(w, MODE, SLIDES + 1),
+            load(w, MODE, SLIDES + 2),
+            load(w, MODE, SLIDES + 3),
+        ),
+    )
+
+
+@kernel
+def mode_of(w, lane):
+    """The same of one lane, in all lanes."""
+    return (
+        (
+            splat(w[MODE, CUT, lane]),
+            splat(w[MODE, CUT + 1, lane]),
+            splat(w[MODE, CUT + 2, lane]),
+            splat(w[MODE, CUT + 3, lane]),
+        ),
+        splat(w[MODE, SWITCHED, lane]),
+        (
+            splat(w[MODE, SLIDES, lane]),
+            splat(w[MODE, SLIDES + 1, lane]),
+            splat(w[MODE, SLIDES + 2, lane]),
+            splat(w[MODE, SLIDES + 3, lane]),
+        ),
+    )
+
+
+@kernel
+def motion(scheme, rob, par, w, row, mode):
     """Motion under a controller, with a given set of torques cut off (eq. 2, 8, 16).
 
     Parameters
@@ -94,12 +162,12 @@ def motion(scheme, rob, par, cut, switched, a, da):
         Code of the control scheme.
     rob, par : numpy.ndarray
         Packed model and controller.
-    cut : tuple of 4
-        For each joint: 0, or the sign of the limit at which its torque is held.
-    switched : float
-        1 if the controller has switched, else 0.
-    a, da : tuple of 5
-        Absolute angles (rad) and rates (rad/s).
+    w : numpy.ndarray
+        Scratch.
+    row : int
+        Where the states stand.
+    mode : tuple
+        As `mode_of` gives it. A torque cut off is held at the limit of which it has the sign.
 
     Returns
     -------
@@ -108,100 +176,16 @@ def motion(scheme, rob, par, cut, switched, a, da):
         N m), force of the ground on the stance foot (tangential, normal, N), and sines and cosines
         of the angles (5 each).
     """
+    a, da = angles(w, row), rates(w, row)
+    cut, switched, slides = mode
     s, c = dynamics.sines(a)
-    alpha, beta = _command(scheme, par, a, da, switched)
+    alpha, beta = _command(scheme, par, w, row, a, da, switched, slides)
     dda, wanted = _wanted(rob, s, c, da, alpha, beta)
     applied = wanted
     off = _off(scheme, switched)
-    if _is_cut(cut, off):
+    is_cut = _is_cut(cut, off)
+    if any_lane(is_cut):
         applied = _applied(rob, cut, off, wanted)
-        dda = dynamics.free_motion(rob, s, c, da, applied)
-    return dda, wanted, applied, dynamics.ground_force(rob, s, c, da, dda), s, c
-
-
-@kernel
-def mode_of(w, lane):
-    """Which torques are cut off in a lane, and whether its controller has switched."""
-    cut = (
-        w[MODE, CUT, lane],
-        w[MODE, CUT + 1, lane],
-        w[MODE, CUT + 2, lane],
-        w[MODE, CUT + 3, lane],
-    )
-    return cut, w[MODE, SWITCHED, lane]
-
-
-@kernel
-def any_cut(scheme, w):
-    """Whether any lane has a torque cut off, or all."""
-    cut = (
-        load(w, MODE, CUT),
-        load(w, MODE, CUT + 1),
-        load(w, MODE, CUT + 2),
-        load(w, MODE, CUT + 3),
-    )
-    return any_lane(_is_cut(cut, _off(scheme, load(w, MODE, SWITCHED))))
-
-
-@kernel
-def angles(w, row):
-    """Five angles in all lanes."""
-    return (load(w, row, 0), load(w, row, 1), load(w, row, 2), load(w, row, 3), load(w, row, 4))
-
-
-@kernel
-def rates(w, row):
-    """Five rates in all lanes."""
-    return (load(w, row, 5), load(w, row, 6), load(w, row, 7), load(w, row, 8), load(w, row, 9))
-
-
-@kernel
-def lanes_motion(scheme, rob, par, w, row, free):
-    """`motion` in all lanes for the states in a row, and the state's rates.
-
-    ``free`` tells whether a torque is cut off in any of them.
-    """
-    a, da = angles(w, row), rates(w, row)
-    s, c = dynamics.sines(a)
-    if scheme == HZD:
-        alpha, beta = hzd.command(par, a, da)
-    else:
-        for lane in range(LANES):
-            al, be = _command(
-                scheme,
-                par,
-                (
-                    w[row, 0, lane],
-                    w[row, 1, lane],
-                    w[row, 2, lane],
-                    w[row, 3, lane],
-                    w[row, 4, lane],
-                ),
-                (
-                    w[row, 5, lane],
-                    w[row, 6, lane],
-                    w[row, 7, lane],
-                    w[row, 8, lane],
-                    w[row, 9, lane],
-                ),
-                w[MODE, SWITCHED, lane],
-            )
-            for i in range(5):
-                w[COMMAND, i, lane] = al[i]
-                w[COMMAND, 5 + i, lane] = be[i]
-        alpha, beta = angles(w, COMMAND), rates(w, COMMAND)
-    dda, wanted = _wanted(rob, s, c, da, alpha, beta)
-    applied = wanted
-    if free:
-        cut = (
-            load(w, MODE, CUT),
-            load(w, MODE, CUT + 1),
-            load(w, MODE, CUT + 2),
-            load(w, MODE, CUT + 3),
-        )
-        off = _off(scheme, load(w, MODE, SWITCHED))
-        applied = _applied(rob, cut, off, wanted)
-        is_cut = _is_cut(cut, off)
         moved = dynamics.free_motion(rob, s, c, da, applied)
         dda = (
             select(is_cut, moved[0], dda[0]),
@@ -210,7 +194,7 @@ def lanes_motion(scheme, rob, par, w, row, free):
             select(is_cut, moved[3], dda[3]),
             select(is_cut, moved[4], dda[4]),
         )
-    return da, dda, wanted, applied, dynamics.ground_force(rob, s, c, da, dda), s, c
+    return dda, wanted, applied, dynamics.ground_force(rob, s, c, da, dda), s, c
 
 
 @kernel
@@ -227,19 +211,14 @@ def beyond(rob, cut, wanted):
 
 
 @kernel
-def which_cut(rob, wanted):
-    """Which torques are beyond the limit: 0 or a sign for each joint."""
+def cut_off(rob, wanted):
+    """Whether a torque is beyond the limit: 0 or its sign."""
     limit = rob[r.TORQUE_LIMIT]
-    return (
-        (1.0 if wanted[0] > limit else 0.0) - (1.0 if wanted[0] < -limit else 0.0),
-        (1.0 if wanted[1] > limit else 0.0) - (1.0 if wanted[1] < -limit else 0.0),
-        (1.0 if wanted[2] > limit else 0.0) - (1.0 if wanted[2] < -limit else 0.0),
-        (1.0 if wanted[3] > limit else 0.0) - (1.0 if wanted[3] < -limit else 0.0),
-    )
+    return select(wanted > limit, 1.0, select(wanted < -limit, -1.0, 0.0))
 
 
 @kernel
-def closed_loop(scheme, switched, rob, par, y, rate, torques):
+def closed_loop(scheme, switched, rob, par, w, y, rate, torques):
     """Time derivative of angles, rates and energy under a controller, for integrators of others.
 
     Parameters
@@ -250,25 +229,36 @@ def closed_loop(scheme, switched, rob, par, y, rate, torques):
         Whether the controller has switched.
     rob, par : numpy.ndarray
         Packed model and controller.
+    w : numpy.ndarray
+        Scratch, as `empty_scratch` gives it.
     y : numpy.ndarray
         Absolute angles (rad), rates (rad/s), and energy (J), shape (11,).
     rate, torques : numpy.ndarray
         Set to the derivative of ``y``, shape (11,), and to u1 to u4 (N m), shape (4,).
     """
-    a, da = (y[0], y[1], y[2], y[3], y[4]), (y[5], y[6], y[7], y[8], y[9])
-    after = 1.0 if switched else 0.0
-    none = (0.0, 0.0, 0.0, 0.0)
-    dda, wanted, applied, _, _, _ = motion(scheme, rob, par, none, after, a, da)
-    if beyond(rob, none, wanted) > 0.0:
-        cut = which_cut(rob, wanted)
-        dda, _, applied, _, _, _ = motion(scheme, rob, par, cut, after, a, da)
-    power = powers(applied, da)
+    for i in range(10):
+        for lane in range(LANES):
+            w[SPARE, i, lane] = y[i]
+    no = splat(0.0)
+    none = (no, no, no, no)
+    after = splat(1.0 if switched else 0.0)
+    dda, wanted, applied, _, _, _ = motion(scheme, rob, par, w, SPARE, (none, after, none))
+    if any_lane(beyond(rob, none, wanted) > 0.0):
+        cut = (
+            cut_off(rob, wanted[0]),
+            cut_off(rob, wanted[1]),
+            cut_off(rob, wanted[2]),
+            cut_off(rob, wanted[3]),
+        )
+        dda, _, applied, _, _, _ = motion(scheme, rob, par, w, SPARE, (cut, after, none))
+    rate[10] = 0.0
+    power = powers(applied, rates(w, SPARE))
     for i in range(5):
-        rate[i] = da[i]
-        rate[5 + i] = dda[i]
-    rate[10] = abs(power[0]) + abs(power[1]) + abs(power[2]) + abs(power[3])
+        rate[i] = y[5 + i]
+        rate[5 + i] = lane_of(dda[i], 0)
     for i in range(4):
-        torques[i] = applied[i]
+        rate[10] += abs(lane_of(power[i], 0))
+        torques[i] = lane_of(applied[i], 0)
 
 
 @kernel

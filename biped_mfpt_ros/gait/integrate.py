@@ -16,16 +16,17 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.gait.closed_loop import (
-    any_cut,
     beyond,
-    lanes_motion,
     margin,
+    mode_of_all,
+    motion,
     powers,
+    rates,
 )
 from biped_mfpt_ros.gait.scratch import (
     BEYOND,
+    CLEARANCE,
     COSINES,
-    CUT,
     DENSE,
     END,
     ERROR_3,
@@ -42,7 +43,6 @@ from biped_mfpt_ros.gait.scratch import (
     STAGE,
     STATES,
     TANGENTIAL,
-    WANTED,
     WORK,
     Y_NEW,
     H,
@@ -287,14 +287,15 @@ _WEIGHT = np.array([weight for stage in _STAGES for _, weight in stage])
 
 
 @kernel
-def _stage(scheme, rob, par, w, h, stage, into, columns, free):
+def _stage(scheme, rob, par, w, h, stage, into, columns, mode):
     """One stage, in all lanes: its state into a row, its derivative into one of its own."""
     for i in range(columns):
         total = _WEIGHT[_START[stage]] * load(w, STAGE + _FROM[_START[stage]], i)
         for n in range(_START[stage] + 1, _START[stage + 1]):
             total = total + _WEIGHT[n] * load(w, STAGE + _FROM[n], i)
         store(w, into, i, load(w, Y, i) + h * total)
-    da, dda, wanted, applied, force, s, c = lanes_motion(scheme, rob, par, w, into, free)
+    da = rates(w, into)
+    dda, wanted, applied, force, s, c = motion(scheme, rob, par, w, into, mode)
     power = powers(applied, da)
     row = STAGE + stage
     for i in range(5):
@@ -311,35 +312,28 @@ def trial_step(scheme, rob, par, w):
 
     Sets the rows ESTIMATE and END.
     """
-    free = any_cut(scheme, w)
+    mode = mode_of_all(w)
     h = load(w, MODE, H)
-    cut = (
-        load(w, MODE, CUT),
-        load(w, MODE, CUT + 1),
-        load(w, MODE, CUT + 2),
-        load(w, MODE, CUT + 3),
-    )
     least = h * 0.0 + math.inf
     most = -least
     normal = least
     over = most
     for stage in range(1, STAGES + 1):
         columns = SIZE if stage == STAGES else STATES
-        wanted, force, s, c = _stage(scheme, rob, par, w, h, stage, Y_NEW, columns, free)
+        wanted, force, s, c = _stage(scheme, rob, par, w, h, stage, Y_NEW, columns, mode)
         m = margin(rob, force)
         least = select(m < least, m, least)
         most = select(m > most, m, most)
         normal = select(force[1] < normal, force[1], normal)
-        u = beyond(rob, cut, wanted)
+        u = beyond(rob, mode[0], wanted)
         over = select(u > over, u, over)
         if stage == STAGES:
             for i in range(5):
                 store(w, END, SINES + i, s[i])
                 store(w, END, COSINES + i, c[i])
-            for i in range(4):
-                store(w, END, WANTED + i, wanted[i])
             store(w, ESTIMATE, TANGENTIAL, force[0])
             store(w, ESTIMATE, NORMAL, force[1])
+            store(w, ESTIMATE, CLEARANCE, u)
     store(w, ESTIMATE, LEAST, least)
     store(w, ESTIMATE, MOST, most)
     store(w, ESTIMATE, LEAST_NORMAL, normal)
@@ -374,7 +368,7 @@ def estimated_error(w, lane):
 @kernel
 def prepare_dense(scheme, rob, par, w):
     """Compute the dense output of the step just tried, in all lanes."""
-    free = any_cut(scheme, w)
+    mode = mode_of_all(w)
     h = load(w, MODE, H)
     for i in range(SIZE):
         end = load(w, Y_NEW, i)
@@ -384,7 +378,7 @@ def prepare_dense(scheme, rob, par, w):
         store(w, DENSE + 1, i, second)
         store(w, DENSE + 2, i, 2.0 * first - h * (load(w, STAGE, i) + load(w, STAGE + STAGES, i)))
     for stage in range(STAGES + 1, STAGES + 1 + DENSE_STAGES):
-        _stage(scheme, rob, par, w, h, stage, SPARE, STATES, free)
+        _stage(scheme, rob, par, w, h, stage, SPARE, STATES, mode)
     for i in range(SIZE):
         for power in range(4):
             total = _DENSE[power, 0] * load(w, STAGE, i)

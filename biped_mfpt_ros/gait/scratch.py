@@ -26,8 +26,10 @@ WORK = 10
     END,  # where the step ends, columns below
     ESTIMATE,  # of the error, and what else was seen in the stages, columns below
     FEET,  # swing foot within the step: x, y (m), dx, dy (m/s) at up to three places
-) = range(8)
-LOBE = 8
+    PLACES,  # of one lane, at as many fractions of the step as there are lanes: columns below
+    IMPACTS,  # the same: angles (5), rates after the impact (5), impulse (2), velocity (2)
+) = range(10)
+LOBE = 10
 """Row of the first of four joints: up to four fractions of the step where the joint's power changes
 its sign, 2 for none, then its work up to each of them (J)."""
 STAGE = LOBE + 4
@@ -37,14 +39,14 @@ DENSE = STAGE + 16
 ROWS = DENSE + 7
 
 # Columns of MODE: signs of the torques cut off (4), whether the controller has switched (0 or 1),
-# length of the step (s).
-CUT, SWITCHED, H = 0, 4, 5
-# Columns of END: sines (5) and cosines (5) of the angles, and torques that the controller wants.
-SINES, COSINES, WANTED = 0, 5, 10
+# length of the step (s), which outputs are in sliding mode (4, 0 or 1).
+CUT, SWITCHED, H, SLIDES = 0, 4, 5, 6
+# Columns of END: sines (5) and cosines (5) of the angles.
+SINES, COSINES = 0, 5
 # Columns of ESTIMATE: error of order 5 and of order 3, least and greatest margin against slipping
 # and least normal force over the stages (N), how far a torque is beyond its limit, at most (N m),
-# and force at the end of the step.
-ERROR_5, ERROR_3, LEAST, MOST, LEAST_NORMAL, BEYOND, TANGENTIAL, NORMAL = range(8)
+# and at the end of the step: force (N), and the latter again.
+ERROR_5, ERROR_3, LEAST, MOST, LEAST_NORMAL, BEYOND, TANGENTIAL, NORMAL, CLEARANCE = range(9)
 
 
 @kernel
@@ -52,6 +54,9 @@ def empty_scratch():
     """Scratch of a kernel, zeros."""
     return np.zeros((ROWS, SIZE, LANES))
 
+
+# Columns of PLACES: fraction, between which fractions, normal of the slope, how it turned out.
+AT, LOW, HIGH, NORMAL_X, NORMAL_Y, FOUND, VALUE, LOAD, ENERGY_AT, LENGTH, TOUCHES = range(11)
 
 # Rows of a swing's variables, of shape (VARIABLES, LANES).
 (
@@ -81,5 +86,8 @@ def empty_scratch():
     END_Y,
     END_DX,
     END_DY,
-) = range(26)
-VARIABLES = 26
+    SLIDE,  # 1 if an output begins to slide in it
+    LAST_H,  # length and error of the step before, 0 if the motion was not smooth since then
+    LAST_ERROR,
+) = range(29)
+VARIABLES = 29

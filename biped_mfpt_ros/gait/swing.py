@@ -9,18 +9,36 @@ from __future__ import annotations
 
 import math
 
-from biped_mfpt_ros.gait.closed_loop import beyond, margin, motion, powers, switch, which_cut
+from biped_mfpt_ros.control import smc
+from biped_mfpt_ros.control.controller import SMC
+from biped_mfpt_ros.gait.closed_loop import (
+    beyond,
+    cut_off,
+    lane_angles,
+    lane_rates,
+    margin,
+    mode_of_all,
+    motion,
+    powers,
+    rates,
+    switch,
+)
 from biped_mfpt_ros.gait.events import (
     CUT_RESOLUTION,
     body_root,
     body_touches,
+    body_touches_at,
     cubic_root,
     first_below,
     first_change,
     foot_at,
+    foot_once,
     foot_root,
+    force_once,
     may_dip,
     motion_at,
+    root_once,
+    slide_root,
     slip_root,
     switch_root,
 )
@@ -35,10 +53,12 @@ from biped_mfpt_ros.gait.integrate import (
 )
 from biped_mfpt_ros.gait.scratch import (
     ACCEPTED,
+    AT,
     BACK_COS,
     BACK_SIN,
     BEYOND,
     CHANGES,
+    CLEARANCE,
     COSINES,
     CUT,
     END,
@@ -47,6 +67,7 @@ from biped_mfpt_ros.gait.scratch import (
     END_X,
     END_Y,
     ENERGY,
+    ENERGY_AT,
     ESTIMATE,
     EVALUATIONS,
     FAILURE,
@@ -55,20 +76,32 @@ from biped_mfpt_ros.gait.scratch import (
     FOOT_DY,
     FOOT_X,
     FOOT_Y,
+    HIGH,
+    IMPACTS,
+    LAST_ERROR,
+    LAST_H,
     LEAST,
     LEAST_NORMAL,
+    LENGTH,
+    LOAD,
     LOBE,
+    LOW,
     LOWEST,
     MARGIN,
     MODE,
     MOST,
     NEAR,
     NORMAL,
+    NORMAL_X,
+    NORMAL_Y,
     PASSED,
+    PLACES,
     SAMPLES,
     SINCE,
     SINES,
     SIZE,
+    SLIDE,
+    SLIDES,
     SLIPS,
     STAGE,
     STATES,
@@ -78,13 +111,15 @@ from biped_mfpt_ros.gait.scratch import (
     TANGENTIAL,
     TIME,
     TODO,
+    TOUCHES,
+    VALUE,
     WORK,
     Y_NEW,
     H,
     Y,
 )
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.lanes import LANES
+from biped_mfpt_ros.lanes import LANES, lane_of, load, select, splat, store
 from biped_mfpt_ros.walker import impact
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.dynamics import foot, sine_cosine, sines
@@ -124,6 +159,18 @@ _NODES = (0.0, _N1, _N2, _N3, 1.0)
 def _unloaded(rob):
     """N: a foot that slips under no load to speak of is one that lifts."""
     return 1e-6 * rob[r.MASS] * rob[r.GRAVITY]
+
+
+@kernel
+def _of_lane(x, lane):
+    """Five numbers of one lane."""
+    return (
+        lane_of(x[0], lane),
+        lane_of(x[1], lane),
+        lane_of(x[2], lane),
+        lane_of(x[3], lane),
+        lane_of(x[4], lane),
+    )
 
 
 @kernel
@@ -179,12 +226,13 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
     v[EVALUATIONS, lane] = 0.0
     v[SAMPLES, lane] = 0.0
     v[FAILURE, lane] = -1.0
+    v[LAST_H, lane] = 0.0
     v[BACK_SIN, lane], v[BACK_COS, lane] = sine_cosine(previous)
     w[MODE, H, lane] = 0.02 * _root(rob[r.TOLERANCE] / 1e-9)
-    w[MODE, SWITCHED, lane] = 0.0 if switch(scheme, par, w[Y, 0:5, lane]) > 0.0 else 1.0
-    s, c, force = _restart(scheme, rob, par, w, v, lane, True)
-    da = _rates(w, Y, lane)
-    x, y, dx, dy = foot(rob, s, c, da)
+    w[MODE, SWITCHED, lane] = 0.0 if switch(scheme, par, lane_angles(w, Y, lane)) > 0.0 else 1.0
+    lanes_s, lanes_c, normal = _restart(scheme, rob, par, w, v, lane, True)
+    s, c = _of_lane(lanes_s, lane), _of_lane(lanes_c, lane)
+    x, y, dx, dy = foot(rob, s, c, lane_rates(w, Y, lane))
     v[FOOT_X, lane], v[FOOT_Y, lane], v[FOOT_DX, lane], v[FOOT_DY, lane] = x, y, dx, dy
     height = y * v[BACK_COS, lane] - x * v[BACK_SIN, lane]
     v[LOWEST, lane] = min(height, 0.0) - _CLEARANCE
@@ -195,7 +243,7 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
     if not (x < 0.0 and height >= -FOOT_TOLERANCE):
         v[FAILURE, lane] = _SCUFFS
         return
-    if not force[1] > _unloaded(rob):
+    if not normal > _unloaded(rob):
         v[FAILURE, lane] = _LIFTS
         return
     if not v[MARGIN, lane] > 0.0:
@@ -212,52 +260,68 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
 
 
 @kernel
-def _angles(w, row, lane):
-    return (w[row, 0, lane], w[row, 1, lane], w[row, 2, lane], w[row, 3, lane], w[row, 4, lane])
-
-
-@kernel
-def _rates(w, row, lane):
-    return (w[row, 5, lane], w[row, 6, lane], w[row, 7, lane], w[row, 8, lane], w[row, 9, lane])
-
-
-@kernel
-def _cut(w, lane):
-    return (
-        w[MODE, CUT, lane],
-        w[MODE, CUT + 1, lane],
-        w[MODE, CUT + 2, lane],
-        w[MODE, CUT + 3, lane],
-    )
-
-
-@kernel
 def _restart(scheme, rob, par, w, v, lane, afresh):
     """Evaluate the closed loop at row Y, for the next step; ``afresh``: find what is cut off.
 
-    Returns sines and cosines of the angles, and the force on the stance foot.
+    Returns sines and cosines of the angles, and the force on the stance foot, in all lanes.
     """
-    a, da = _angles(w, Y, lane), _rates(w, Y, lane)
-    switched = w[MODE, SWITCHED, lane]
     if afresh:
         for i in range(4):
             w[MODE, CUT + i, lane] = 0.0
-    dda, wanted, applied, force, s, c = motion(scheme, rob, par, _cut(w, lane), switched, a, da)
+            w[MODE, SLIDES + i, lane] = 0.0
+    mode = mode_of_all(w)
+    dda, wanted, applied, force, s, c = motion(scheme, rob, par, w, Y, mode)
     v[EVALUATIONS, lane] += 1
-    if afresh and beyond(rob, _cut(w, lane), wanted) > 0.0:
-        cut = which_cut(rob, wanted)
+    if afresh and lane_of(beyond(rob, mode[0], wanted), lane) > 0.0:
         for i in range(4):
-            w[MODE, CUT + i, lane] = cut[i]
-        dda, wanted, applied, force, s, c = motion(scheme, rob, par, cut, switched, a, da)
+            w[MODE, CUT + i, lane] = lane_of(cut_off(rob, wanted[i]), lane)
+        mode = mode_of_all(w)
+        dda, wanted, applied, force, s, c = motion(scheme, rob, par, w, Y, mode)
         v[EVALUATIONS, lane] += 1
+    da = rates(w, Y)
     power = powers(applied, da)
     for i in range(5):
-        w[STAGE, i, lane] = da[i]
-        w[STAGE, 5 + i, lane] = dda[i]
+        w[STAGE, i, lane] = lane_of(da[i], lane)
+        w[STAGE, 5 + i, lane] = lane_of(dda[i], lane)
     for i in range(4):
-        w[STAGE, WORK + i, lane] = power[i]
-    v[MARGIN, lane] = margin(rob, force)
-    return s, c, force
+        w[STAGE, WORK + i, lane] = lane_of(power[i], lane)
+    v[MARGIN, lane] = lane_of(margin(rob, force), lane)
+    return s, c, lane_of(force[1], lane)
+
+
+@kernel
+def _begins_to_slide(rob, par, w, lane):
+    """Whether an output may slide at the end of the step, and did not before."""
+    if w[ESTIMATE, CLEARANCE, lane] > -smc.CLEAR * rob[r.TORQUE_LIMIT]:
+        return False
+    for i in range(4):
+        if w[MODE, CUT + i, lane] != 0.0:
+            return False
+    a, da = lane_angles(w, Y_NEW, lane), lane_rates(w, Y_NEW, lane)
+    for i in range(4):
+        slides = w[MODE, SLIDES + i, lane] != 0.0
+        if not slides and smc.off_slide(par, i, a, da, w[MODE, SWITCHED, lane]) <= 0.0:
+            return True
+    return False
+
+
+@kernel
+def _choose_slides(par, w, lane, may):
+    """Put outputs into sliding mode, or take them out; returns whether any changed."""
+    changed = False
+    cut = False
+    for i in range(4):
+        cut = cut or w[MODE, CUT + i, lane] != 0.0
+    a, da = lane_angles(w, Y, lane), lane_rates(w, Y, lane)
+    for i in range(4):
+        slides = w[MODE, SLIDES + i, lane] != 0.0
+        off = math.inf
+        if may and not cut:
+            off = smc.off_slide(par, i, a, da, w[MODE, SWITCHED, lane])
+        if slides == cut and (cut or off <= 0.0):
+            w[MODE, SLIDES + i, lane] = 0.0 if slides else 1.0
+            changed = True
+    return changed
 
 
 @kernel
@@ -352,16 +416,15 @@ def _inspect(scheme, rob, par, w, v, lane, slopes):
     v[STEPS, lane] += 1.0
     changes = w[ESTIMATE, BEYOND, lane] > CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
     switched = w[MODE, SWITCHED, lane] > 0.5
-    switches = (switch(scheme, par, w[Y_NEW, 0:5, lane]) > 0.0) == switched
+    switches = (switch(scheme, par, lane_angles(w, Y_NEW, lane)) > 0.0) == switched
     least = min(w[ESTIMATE, LEAST, lane], v[MARGIN, lane])
     most = max(w[ESTIMATE, MOST, lane], v[MARGIN, lane])
     uncertain = 0.25 * (most - least) + 1e-3 * rob[r.MASS] * rob[r.GRAVITY]
     slips = not (
         least > uncertain and w[ESTIMATE, LEAST_NORMAL, lane] > uncertain and v[SINCE, lane] < 0.0
     )
-    s = (w[END, 0, lane], w[END, 1, lane], w[END, 2, lane], w[END, 3, lane], w[END, 4, lane])
-    c = (w[END, 5, lane], w[END, 6, lane], w[END, 7, lane], w[END, 8, lane], w[END, 9, lane])
-    x, y, dx, dy = foot(rob, s, c, _rates(w, Y_NEW, lane))
+    s, c = lane_angles(w, END, lane), lane_rates(w, END, lane)  # where its sines and cosines stand
+    x, y, dx, dy = foot(rob, s, c, lane_rates(w, Y_NEW, lane))
     v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane] = x, y, dx, dy
     i = int(v[TODO, lane]) - 1
     slope = (slopes[i, 0], slopes[i, 1])
@@ -371,11 +434,13 @@ def _inspect(scheme, rob, par, w, v, lane, slopes):
         near = near or x >= 0.0 or _may_reach(v, lane, -back[0], back[1], h)
     else:
         near = near or x < 0.0 or _may_reach(v, lane, -slope[0], slope[1], h)
+    slide = scheme == SMC and _begins_to_slide(rob, par, w, lane)
+    v[SLIDE, lane] = 1.0 if slide else 0.0
     v[CHANGES, lane] = 1.0 if changes else 0.0
     v[SWITCHES, lane] = 1.0 if switches else 0.0
     v[SLIPS, lane] = 1.0 if slips else 0.0
     v[NEAR, lane] = 1.0 if near else 0.0
-    return changes or switches or slips or near
+    return changes or switches or slips or near or slide
 
 
 @kernel
@@ -405,6 +470,13 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
         at = switch_root(scheme, par, w, lane, w[MODE, SWITCHED, lane] > 0.5, h)
         if at <= end:
             end, joint, switches = at, -1, True
+    if v[SLIDE, lane] != 0.0:
+        for i in range(4):
+            at = 1.0
+            if w[MODE, SLIDES + i, lane] == 0.0:
+                at = slide_root(scheme, rob, par, w, lane, i, h)
+            if at < end:
+                end, joint, switches = at, -1, False
     if end < 1.0:
         _cut_short(rob, w, v, lane, end)
 
@@ -422,29 +494,32 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
         _sample(scheme, rob, par, w, v, trace, until)
     if failure >= 0:
         v[FAILURE, lane] = failure
-        v[ENERGY, lane] = _energy(w, v, lane, stop)
+        v[ENERGY, lane] = lane_of(_energy(w, v, lane, splat(stop)), 0)
         v[TIME, lane] = t + stop * h
         return
 
-    v[ENERGY, lane] = _energy(w, v, lane, end)
+    v[ENERGY, lane] = _energy_at_end(w, v, lane, end)
     v[TIME, lane] = t + end * h
     v[FOOT_X, lane], v[FOOT_Y, lane] = v[END_X, lane], v[END_Y, lane]
     v[FOOT_DX, lane], v[FOOT_DY, lane] = v[END_DX, lane], v[END_DY, lane]
     for i in range(STATES):
         w[Y, i, lane] = w[Y_NEW, i, lane]
     error = estimated_error(w, lane)
-    w[MODE, H, lane] = h * (5.0 if error < 1e-6 else min(5.0, 0.9 / _root(error)))
+    w[MODE, H, lane] = h * _growth(v, lane, h, error)
     if joint >= 0:
         w[MODE, CUT + joint, lane] = held
     if switches:
         w[MODE, SWITCHED, lane] = 1.0 - w[MODE, SWITCHED, lane]
         w[MODE, H, lane] = min(w[MODE, H, lane], 0.25 * h)
-    if joint >= 0 or switches:
-        _, _, force = _restart(scheme, rob, par, w, v, lane, switches)
+    slides = scheme == SMC and not switches and _choose_slides(par, w, lane, v[SLIDE, lane] != 0.0)
+    v[LAST_H, lane], v[LAST_ERROR, lane] = h, max(error, 1e-2)
+    if end < 1.0 or joint >= 0 or switches or slides:
+        v[LAST_H, lane] = 0.0
+        _, _, normal = _restart(scheme, rob, par, w, v, lane, switches)
         if switches and v[SINCE, lane] < 0.0 and not v[MARGIN, lane] > 0.0:
             v[SINCE, lane] = v[TIME, lane]
             if rob[r.SLIP_DURATION] == 0.0:
-                v[FAILURE, lane] = _SLIPS if force[1] > _unloaded(rob) else _LIFTS
+                v[FAILURE, lane] = _SLIPS if normal > _unloaded(rob) else _LIFTS
     else:
         for i in range(SIZE):
             w[STAGE, i, lane] = w[STAGE + STAGES, i, lane]
@@ -452,15 +527,34 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
 
 
 @kernel
+def _growth(v, lane, h, error):
+    """By which the next step may be longer, from the errors of this one and the one before.
+
+    Where errors grow from step to step, the next one is shortened in time [1]_.
+
+    .. [1] K. Gustafsson, "Control-theoretic techniques for stepsize selection in implicit
+       Runge-Kutta methods", ACM Transactions on Mathematical Software 20 (1994).
+    """
+    if error < 1e-6:
+        return 5.0
+    factor = min(5.0, 0.9 / _root(error))
+    if v[LAST_H, lane] > 0.0:
+        trend = h / v[LAST_H, lane] * _root(v[LAST_ERROR, lane] / error)
+        factor = min(factor, max(0.2, factor * trend))
+    return factor
+
+
+@kernel
 def _cut_short(rob, w, v, lane, end):
     """End the step at a fraction of it."""
+    at = splat(end)
     for i in range(SIZE):
-        w[Y_NEW, i, lane] = interpolate(w, lane, i, end)
-    s, c = sines(_angles(w, Y_NEW, lane))
+        w[Y_NEW, i, lane] = lane_of(interpolate(w, lane, i, at), 0)
+    s, c = sines(lane_angles(w, Y_NEW, lane))
     for i in range(5):
         w[END, SINES + i, lane] = s[i]
         w[END, COSINES + i, lane] = c[i]
-    x, y, dx, dy = foot(rob, s, c, _rates(w, Y_NEW, lane))
+    x, y, dx, dy = foot(rob, s, c, lane_rates(w, Y_NEW, lane))
     v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane] = x, y, dx, dy
 
 
@@ -473,16 +567,21 @@ def _first_fall(scheme, rob, par, w, v, lane, end, h):
     t, since = v[TIME, lane], v[SINCE, lane]
     last, last_value = 0.0, v[MARGIN, lane]
     slipping = since >= 0.0
-    samples = 2 + int(end * h / _SLIP_INTERVAL)
-    for k in range(1, samples + 1):
-        at = end * k / samples
-        _, _, force = motion_at(scheme, rob, par, w, lane, at)
-        v[EVALUATIONS, lane] += 1
-        value = margin(rob, force)
+    samples = LANES * (1 + int(end * h / (LANES * _SLIP_INTERVAL)))
+    for k in range(samples):
+        place = k % LANES
+        if place == 0:
+            for i in range(LANES):
+                w[PLACES, AT, i] = end * (k + i + 1) / samples
+            _, _, force = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
+            v[EVALUATIONS, lane] += LANES
+            store(w, PLACES, VALUE, margin(rob, force))
+            store(w, PLACES, LOAD, force[1])
+        at, value, normal = w[PLACES, AT, place], w[PLACES, VALUE, place], w[PLACES, LOAD, place]
         slips = not value > 0.0
         began, until = since, t + at * h
         if slips != slipping:
-            root = slip_root(scheme, rob, par, w, lane, last, last_value, at, value, h)
+            root = slip_root(scheme, rob, par, w, lane, False, last, last_value, at, value, h)
             if slips:
                 since = t + root * h
                 began = since
@@ -491,11 +590,13 @@ def _first_fall(scheme, rob, par, w, v, lane, end, h):
                 since = -1.0
         if (slips or slipping) and began + rob[r.SLIP_DURATION] <= until:
             stop = min(end, max(0.0, (began + rob[r.SLIP_DURATION] - t) / h))
-            _, _, force = motion_at(scheme, rob, par, w, lane, stop)
+            _, normal = force_once(scheme, rob, par, w, lane, stop)
             v[SINCE, lane] = since
-            return stop, (_SLIPS if force[1] > _unloaded(rob) else _LIFTS)
-        if not force[1] > 0.0:
+            return stop, (_SLIPS if normal > _unloaded(rob) else _LIFTS)
+        if not normal > 0.0:
             v[SINCE, lane] = since
+            _, before = force_once(scheme, rob, par, w, lane, last)
+            at = slip_root(scheme, rob, par, w, lane, True, last, before, at, normal, h)
             return at, _LIFTS
         slipping, last, last_value = slips, at, value
     v[SINCE, lane] = since
@@ -511,10 +612,13 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
     """
     h = w[MODE, H, lane]
     parts = min(_MOST_PARTS, int(h / _FOOT_INTERVAL) + 1)
-    for k in range(1, parts):
-        x, y, dx, dy = foot_at(rob, w, lane, k / parts)
-        w[FEET, 4 * k - 4, lane], w[FEET, 4 * k - 3, lane] = x, y
-        w[FEET, 4 * k - 2, lane], w[FEET, 4 * k - 1, lane] = dx, dy
+    if parts > 1:
+        for k in range(LANES):
+            w[PLACES, AT, k] = (k + 1) / parts
+        x, y, dx, dy = foot_at(rob, w, lane, load(w, PLACES, AT))
+        for k in range(parts - 1):
+            w[FEET, 4 * k, lane], w[FEET, 4 * k + 1, lane] = lane_of(x, k), lane_of(y, k)
+            w[FEET, 4 * k + 2, lane], w[FEET, 4 * k + 3, lane] = lane_of(dx, k), lane_of(dy, k)
     at_start = (v[FOOT_X, lane], v[FOOT_Y, lane], v[FOOT_DX, lane], v[FOOT_DY, lane])
     at_end = (v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane])
     back = (v[BACK_SIN, lane], v[BACK_COS, lane])
@@ -524,9 +628,9 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
         low, at_low = end, at_end
         if at_end[0] >= 0.0:
             low = _passing(rob, w, lane, -1.0, at_start, at_end, end, h)
-            at_low = foot_at(rob, w, lane, low)
+            at_low = foot_once(rob, w, lane, low)
         # Behind the stance foot: against the ground of the preceding slope.
-        touch = first_below(
+        _, _, touch = first_below(
             rob, w, lane, -back[0], back[1], v[LOWEST, lane], 0.0, at_start, low, at_low, parts, h
         )
         if touch > 1.0 and at_end[0] >= 0.0 and not at_low[1] > 0.0:
@@ -539,39 +643,53 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
     elif at_end[0] < 0.0:
         high = _passing(rob, w, lane, 1.0, at_start, at_end, end, h)
     high = min(stop, high)
-    at_high = at_end if high == end else foot_at(rob, w, lane, high)
+    at_high = at_end if high == end else foot_once(rob, w, lane, high)
 
-    # Slopes that the foot or the body reaches in this step, the steepest first. Each is decided by
-    # itself, so that its outcome does not depend on the others.
+    # Slopes that the foot reaches in this step, the steepest first, some at once. Each is decided
+    # by itself, so that its outcome does not depend on the others.
     todo = int(v[TODO, lane])
+    reached = LANES
+    while reached == LANES and todo > 0:
+        reached = 0
+        while reached < LANES and reached < todo:
+            slope = (slopes[todo - 1 - reached, 0], slopes[todo - 1 - reached, 1])
+            before, until, guess = 2.0, 2.0, 2.0
+            if high > low:
+                before, until, guess = first_below(
+                    rob, w, lane, -slope[0], slope[1], 0.0, low, at_low, high, at_high, parts, h
+                )
+            if guess > 1.0:
+                break
+            for k in range(reached, LANES):  # what is left over does the same again
+                w[PLACES, LOW, k], w[PLACES, HIGH, k], w[PLACES, AT, k] = before, until, guess
+                w[PLACES, NORMAL_X, k], w[PLACES, NORMAL_Y, k] = -slope[0], slope[1]
+            reached += 1
+        if reached > 0:
+            _land(rob, w, v, lane, back, h)
+            for k in range(reached):
+                todo -= 1
+                slope = (slopes[todo, 0], slopes[todo, 1])
+                at = w[PLACES, AT, k]
+                if w[PLACES, TOUCHES, k] != 0.0:
+                    outcomes[todo] = _BODY
+                    at = body_root(rob, w, lane, back, slope, at)
+                    results[2, todo] = lane_of(_energy(w, v, lane, splat(at)), 0)
+                else:
+                    outcomes[todo] = _outcome(rob, w, k, slope, after[todo])
+                    results[2, todo] = w[PLACES, ENERGY_AT, k]
+                    if outcomes[todo] == _STEP:
+                        results[1, todo] = w[PLACES, LENGTH, k]
+                results[0, todo] = v[TIME, lane] + at * h
+    # Slopes that the body reaches before the foot.
     while todo > 0:
         slope = (slopes[todo - 1, 0], slopes[todo - 1, 1])
-        landing = 2.0
-        if high > low:
-            landing = first_below(
-                rob, w, lane, -slope[0], slope[1], 0.0, low, at_low, high, at_high, parts, h
-            )
-        until = min(stop, landing)
-        a, da = _angles(w, Y_NEW, lane), _rates(w, Y_NEW, lane)
-        if until < end:
-            a, da = state_at(w, lane, until)
-        s, c = sines(a)
-        touch = 2.0
-        if body_touches(rob, s, c, back, slope):
-            touch = body_root(rob, w, lane, back, slope, until)
-        if landing > 1.0 and touch > 1.0:
+        if not body_touches_at(rob, w, lane, stop, back, slope):
             break
         todo -= 1
-        if touch < landing:
-            outcomes[todo] = _BODY
-        else:
-            touch = landing
-            outcomes[todo] = _land(rob, s, c, a, da, slope, after[todo])
-            if outcomes[todo] == _STEP:
-                x, y, _, _ = foot(rob, s, c, da)
-                results[1, todo] = math.sqrt(x * x + y * y)
-        results[0, todo] = v[TIME, lane] + touch * h
-        results[2, todo] = _energy(w, v, lane, touch)
+        at = body_root(rob, w, lane, back, slope, stop)
+        outcomes[todo] = _BODY
+        results[0, todo] = v[TIME, lane] + at * h
+        results[2, todo] = lane_of(_energy(w, v, lane, splat(at)), 0)
     v[TODO, lane] = todo
     return stop, failure
 
@@ -579,24 +697,45 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
 @kernel
 def _passing(rob, w, lane, side, at_start, at_end, end, h):
     """When the swing foot passes the stance foot, from ``side`` of it (1: from ahead)."""
-    guess = end * cubic_root(
-        side * at_start[0],
-        side * at_start[2] * end * h,
-        side * at_end[0],
-        side * at_end[2] * end * h,
-    )
-    return foot_root(rob, w, lane, side, 0.0, 0.0, 0.0, end, guess, h)
+    f0, f1 = side * at_start[0], side * at_end[0]
+    d0, d1 = side * at_start[2] * end * h, side * at_end[2] * end * h
+    return root_once(rob, w, lane, side, 0.0, 0.0, end, end * cubic_root(f0, d0, f1, d1), h)
 
 
 @kernel
-def _land(rob, s, c, a, da, slope, after):
-    """Impact on a slope. Returns the outcome and sets ``after``, in absolute angles."""
-    sine, cosine = slope
-    rates, px, py, vx, vy = impact.impact(rob, s, c, da)
+def _land(rob, w, v, lane, back, h):
+    """Impacts on several slopes at once, which stand in the row PLACES; sets row IMPACTS too."""
+    nx, ny = load(w, PLACES, NORMAL_X), load(w, PLACES, NORMAL_Y)
+    at = foot_root(
+        rob, w, lane, nx, ny, load(w, PLACES, LOW), load(w, PLACES, HIGH), load(w, PLACES, AT), h
+    )
+    a, da = state_at(w, lane, at)
+    s, c = sines(a)
+    x, y, _, _ = foot(rob, s, c, da)
+    touches = body_touches(rob, s, c, (splat(back[0]), splat(back[1])), (-nx, ny))
+    new_rates, px, py, vx, vy = impact.impact(rob, s, c, da)
     new = impact.swapped(a)
     for i in range(5):
-        after[i] = new[i]
-        after[5 + i] = rates[i]
+        store(w, IMPACTS, i, new[i])
+        store(w, IMPACTS, 5 + i, new_rates[i])
+    store(w, IMPACTS, 10, px)
+    store(w, IMPACTS, 11, py)
+    store(w, IMPACTS, 12, vx)
+    store(w, IMPACTS, 13, vy)
+    store(w, PLACES, AT, at)
+    store(w, PLACES, TOUCHES, select(touches, 1.0, 0.0 * at))
+    store(w, PLACES, LENGTH, x * x + y * y)
+    store(w, PLACES, ENERGY_AT, _energy(w, v, lane, at))
+
+
+@kernel
+def _outcome(rob, w, place, slope, after):
+    """Outcome of an impact in the row IMPACTS; sets ``after``, in absolute angles."""
+    sine, cosine = slope
+    for i in range(10):
+        after[i] = w[IMPACTS, i, place]
+    px, py = w[IMPACTS, 10, place], w[IMPACTS, 11, place]
+    vx, vy = w[IMPACTS, 12, place], w[IMPACTS, 13, place]
     normal = py * cosine - px * sine
     tangential = px * cosine + py * sine
     for i in range(10):
@@ -612,6 +751,7 @@ def _land(rob, s, c, a, da, slope, after):
         return _IMPACT_SLIPS
     if not vy * cosine - vx * sine > 0.0:
         return _NO_LIFT
+    w[PLACES, LENGTH, place] = math.sqrt(w[PLACES, LENGTH, place])
     return _STEP
 
 
@@ -680,17 +820,33 @@ def _find_lobes(w, lane):
 
 @kernel
 def _energy(w, v, lane, at):
-    """Energy spent up to a fraction of the step, J (eq. 36)."""
+    """Energy spent up to fractions of the step in lanes, J (eq. 36)."""
+    total = splat(v[ENERGY, lane])
+    for i in range(4):
+        row = LOBE + i
+        last = 0.0 * at
+        for k in range(4):
+            if w[row, k, lane] > 1.0:
+                break
+            passed = w[row, k, lane] < at
+            total = total + select(passed, abs(w[row, 4 + k, lane] - last), 0.0)
+            last = select(passed, w[row, 4 + k, lane], last)
+        total = total + abs(interpolate(w, lane, WORK + i, at) - last)
+    return total
+
+
+@kernel
+def _energy_at_end(w, v, lane, end):
+    """The same at the end of the step, with its works in row Y_NEW."""
     total = v[ENERGY, lane]
     for i in range(4):
-        work = w[Y_NEW, WORK + i, lane] if at >= 1.0 else interpolate(w, lane, WORK + i, at)
         last = 0.0
         for k in range(4):
-            if w[LOBE + i, k, lane] >= at:
+            if w[LOBE + i, k, lane] >= end:
                 break
             total += abs(w[LOBE + i, 4 + k, lane] - last)
             last = w[LOBE + i, 4 + k, lane]
-        total += abs(work - last)
+        total += abs(w[Y_NEW, WORK + i, lane] - last)
     return total
 
 
@@ -701,16 +857,17 @@ def _sample(scheme, rob, par, w, v, trace, until):
     first = 0 if samples == 0 else 1
     for k in range(first, _TRACE_SAMPLES + 1):
         if samples < trace.shape[0]:
-            at = until * k / _TRACE_SAMPLES
+            at = splat(until * k / _TRACE_SAMPLES)
             a, da = state_at(w, 0, at)
             _, applied, force = motion_at(scheme, rob, par, w, 0, at)
-            trace[samples, 0] = v[TIME, 0] + at * w[MODE, H, 0]
+            trace[samples, 0] = v[TIME, 0] + lane_of(at, 0) * w[MODE, H, 0]
             for i in range(5):
-                trace[samples, 1 + i] = a[i]
-                trace[samples, 6 + i] = da[i]
+                trace[samples, 1 + i] = lane_of(a[i], 0)
+                trace[samples, 6 + i] = lane_of(da[i], 0)
             for i in range(4):
-                trace[samples, 11 + i] = applied[i]
-            trace[samples, 15], trace[samples, 16] = force
-            trace[samples, 17] = _energy(w, v, 0, at)
+                trace[samples, 11 + i] = lane_of(applied[i], 0)
+            trace[samples, 15] = lane_of(force[0], 0)
+            trace[samples, 16] = lane_of(force[1], 0)
+            trace[samples, 17] = lane_of(_energy(w, v, 0, at), 0)
             samples += 1
     v[SAMPLES, 0] = samples
