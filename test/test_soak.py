@@ -5,13 +5,22 @@ from __future__ import annotations
 import json
 import time
 from contextlib import nullcontext
+from random import Random
 
+import numpy as np
 import pytest
+from biped_mfpt_msgs import msg
+from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
+from rclpy.serialization import serialize_message
+from ros_graph import Client, ros_graph
 
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.nodes.analysis import Analysis
+from biped_mfpt_ros.nodes.qos import RESULTS
+from biped_mfpt_ros.nodes.simulator import Simulator
 from biped_mfpt_ros.report.progress import Progress
 from biped_mfpt_ros.soak import __main__ as soak
-from biped_mfpt_ros.soak import fuzz, simulators, targets
+from biped_mfpt_ros.soak import fuzz, inputs, meshes, simulators, targets
 
 QUIET = Progress(quiet=True)
 
@@ -82,3 +91,89 @@ def test_meshes_among_faults_are_those_without():
     assert row.count >= 8
     assert row.failures == 0, row.examples
     assert row.facts["meshes"] > 0
+
+
+def looks(meshes, **changes):
+    """What the nodes held after each mesh; ``changes`` are per mesh, of the mesher."""
+    usual = {"kilobytes": 100_000, "files": 10, "threads": 5}
+    return [
+        {
+            "mesher": {key: value + int(i * changes.get(key, 0)) for key, value in usual.items()},
+            "analysis": dict(usual),
+        }
+        for i in range(meshes)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("case", "said"),
+    [
+        ({}, None),
+        ({"looks": looks(100, kilobytes=50)}, None),  # 3 % after the warm-up
+        ({"looks": looks(100, kilobytes=100)}, "mesher grew by 5.7 % after the warm-up"),
+        ({"looks": looks(100, files=0.1)}, "mesher: 14 files became 19"),
+        ({"looks": looks(100, threads=0.1)}, "mesher: 9 threads became 14"),
+        ({"seconds": np.linspace(0.1, 0.2, 100)}, "a mesh took 150 ms, and 190 ms at the end"),
+        ({"estimates": {5.0, 6.0}}, "2 different MFPT"),
+        ({"whole": False}, "the bag is not whole"),
+        ({"left": {"/dev/shm/fastdds_1"}}, "1 files were left"),
+    ],
+)
+def test_many_meshes_are_judged(case, said):
+    usual = {"looks": looks(100), "seconds": np.full(100, 0.1), "estimates": {5.0}}
+    given = {**usual, "whole": True, "left": set(), **case}
+    row = meshes._judged(
+        100,
+        given["seconds"],
+        given["looks"],
+        given["estimates"],
+        given["whole"],
+        given["left"],
+        1.0,
+    )
+    assert row.failures == (said is not None)
+    assert said is None or said in row.examples[0]
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        yield graph
+
+
+def test_nodes_live_through_bad_input_over_ros(graph):
+    """Bytes that are no messages on every topic, and spoilt requests to every service."""
+    tester = graph.start(Client)
+    graph.start(lambda: Simulator("simulator"), max_evaluations=20_000, max_states=8)
+    graph.start(Analysis)
+    simulate = tester.service(SimulateSteps, "/simulator/simulate_steps")
+    compute = tester.service(ComputeMfpt, "compute_mfpt")
+    garbage = {
+        topic: tester.create_publisher(kind, topic, RESULTS)
+        for topic, kind in (
+            ("mesh/info", msg.MeshInfo),
+            ("mesh/states", msg.MeshStates),
+            ("mesh/transitions", msg.MeshTransitions),
+        )
+    }
+    random = Random(1)
+    refused = 0
+    for i in range(200):
+        response = simulate(inputs.spoil(random, targets._request(random)))
+        assert response.success or "; allowed: " in response.message, response.message
+        refused += not response.success
+        asked = ComputeMfpt.Request(mesh_id="none", mu_s=0.0, sigma_s=[0.02])
+        response = compute(inputs.spoil(random, asked))
+        assert not response.success
+        assert "; allowed: " in response.message
+        if i % 4 == 0:
+            publisher = garbage[random.choice([*garbage])]
+            kind = publisher.msg_type
+            message = inputs.spoil(random, kind(mesh_id="mesh", sequence=i))
+            publisher.publish(
+                message if i % 8 else inputs.spoilt(random, serialize_message(message))
+            )
+    assert 20 < refused < 180
+    request = targets._request(Random(2))
+    request.controller = msg.Controller(name="hzd/base")
+    assert simulate(request).success
