@@ -34,6 +34,8 @@ ROSDEP_KEYS = {
     "zstandard": "mcap-ros2-support",
 }
 """Of what is on the Python package index. mcap, zstandard, mpmath: the key that brings them."""
+OPTIONAL = {"mujoco"}
+"""What a benchmark compares with where it is installed."""
 PIP_NAMES = {"PIL": "pillow", "llvmlite": "numba", "yaml": "pyyaml"}
 """Import name to name on the package index, where they differ."""
 
@@ -67,7 +69,7 @@ def imports(folder):
                 names.update(alias.name.split(".")[0] for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 names.add(node.module.split(".")[0])
-    return names - own - sys.stdlib_module_names
+    return names - own - OPTIONAL - sys.stdlib_module_names
 
 
 def test_version_is_the_same_everywhere():
