@@ -43,7 +43,13 @@ def grow_here(settings: MeshSettings) -> tuple[Mesh, float, float]:
 
     assert settings.initial_state is not None
     start = time.thread_time()
-    mesh = grow_mesh(simulate, settings.initial_state, SLOPES, settings.threshold)
+    mesh = grow_mesh(
+        simulate,
+        settings.initial_state,
+        SLOPES,
+        settings.threshold,
+        max_states=settings.max_states,
+    )
     return mesh, inside, time.thread_time() - start - inside
 
 

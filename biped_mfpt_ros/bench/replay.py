@@ -93,7 +93,7 @@ def serve(node: Node, services: int, swing_seconds: float, answers: Answers) -> 
                     heapq.heappush(due, entry)
             while due and due[0][0] <= time.monotonic():
                 _, _, i, header, response = heapq.heappop(due)
-                handles[i].service_send_response(response, header)
+                handles[i].service_send_response(response, header.request_id)
 
 
 def main() -> None:
