@@ -1,6 +1,7 @@
 """Scores of candidates, stage by stage."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,6 +26,7 @@ from biped_mfpt_ros.optimise.scoring import (
 )
 from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.space import SearchSpace
+from biped_mfpt_ros.study.readings import readings
 from biped_mfpt_ros.walker.robot import ABSOLUTE, WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import slope_set
 
@@ -73,6 +75,15 @@ def test_the_cycle_is_that_of_the_thorough_search(name):
     np.testing.assert_allclose(abs(gait.cycle.eigenvalues[0]), abs(exact.eigenvalues[0]), atol=2e-3)
     assert gait.cycle.speed == pytest.approx(exact.speed, rel=1e-4)
     assert gait.cycle.cost_of_transport == pytest.approx(exact.cost_of_transport, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["hzd/mfpt", "smc/mfpt"])
+def test_a_coarse_tolerance_does_not_hide_the_cycle(name):
+    model = replace(readings()[name].model, tolerance=1e-6)
+    gait = flat_gait(controller(name), model, simulate_steps)
+    exact = find_limit_cycle(controller(name), model=model)  # at 1e-11 whatever the model's
+    assert gait.cycle.stable
+    np.testing.assert_allclose(gait.cycle.state, exact.state, atol=1e-5)
 
 
 def test_clearance_and_torque_are_those_of_the_swing():
