@@ -11,7 +11,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly, BSpline
 
 from biped_mfpt_ros.control import hzd, smc, spline
-from biped_mfpt_ros.control.controller import Controller, controller, controller_names
+from biped_mfpt_ros.control.controller import (
+    Controller,
+    controller,
+    controller_names,
+    paper_controller_names,
+)
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.closed_loop import closed_loop
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
@@ -20,8 +25,8 @@ from biped_mfpt_ros.gait.trace import trace_swing
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker.robot import ABSOLUTE, WalkerModel, rabbit
 
-HZD_NAMES = [n for n in controller_names() if n.startswith("hzd/")]
-SMC_NAMES = [n for n in controller_names() if n.startswith("smc/")]
+HZD_NAMES = [n for n in paper_controller_names() if n.startswith("hzd/")]
+SMC_NAMES = [n for n in paper_controller_names() if n.startswith("smc/")]
 SPLINE_NAMES = [n for n in controller_names() if n.startswith("spline/")]
 FREE = WalkerModel(torque_limit=math.inf)
 RNG = np.random.default_rng(3)
