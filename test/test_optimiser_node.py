@@ -241,13 +241,8 @@ def test_a_node_that_is_replaced_costs_nothing(graph, client, store_path, tmp_pa
     assert outline(kept(store_path, goal.study)) == locally(tmp_path / "l.sqlite", 30)
 
 
-@pytest.mark.parametrize(
-    "victim",
-    [
-        "mesher",
-        *(pytest.param(v, marks=pytest.mark.slow) for v in ("simulator", "analysis", "optimiser")),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", ["simulator", "mesher", "analysis", "optimiser"])
 def test_a_node_that_dies_costs_no_study(graph, victim, tmp_path):
     """One of the processes is killed and started again; the trials are as if it had not been."""
     path, namespace = tmp_path / "studies.sqlite", f"without_{victim}"
