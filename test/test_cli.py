@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -593,6 +594,11 @@ LONG = (
 )  # fmt: skip
 
 
+def run_checkpoint(run):
+    """Where a run keeps the answers of the mesh that it grows."""
+    return Path(tempfile.gettempdir(), f"biped-mfpt-run-{run.process.pid}")
+
+
 class TestRun:
     def test_result_is_that_of_one_process_although_a_simulator_dies(self, tmp_path, capsys):
         arguments = ("--threshold", "0.3", "--sigma", "1", "2")
@@ -656,13 +662,13 @@ class TestRun:
         assert "analysis was killed by SIGKILL; the end of run/logs/analysis.log:" in err
         assert "ready" in err.partition("analysis.log:")[2]
         assert run.nodes() == {}
-        assert not (tmp_path / "run" / "checkpoint").exists()
+        assert not run_checkpoint(run).exists()
 
     def test_a_mesher_that_is_killed_is_replaced_and_the_mesh_goes_on(self, tmp_path, capsys):
         arguments = ("--threshold", "0.003", "--sigma", "2")
         more = ("--workers", "1", "--walks", "0", "--json", "--output", "run")
         run = Run(tmp_path, *arguments, *more)
-        kept = tmp_path / "run" / "checkpoint"
+        kept = run_checkpoint(run)
         wait_until(
             lambda: any(path.stat().st_size > 20_000 for path in kept.glob("*.journal")),
             run,

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -82,7 +83,8 @@ def run(args: argparse.Namespace) -> None:
     }
     picture = directory / "mfpt.png"
     with (
-        _removed(directory / "checkpoint") as checkpoint,
+        # Not beside the bag: a disk that the bag fills up must not end the mesh.
+        _removed(Path(gettempdir(), f"biped-mfpt-run-{os.getpid()}")) as checkpoint,
         Progress(quiet=args.quiet) as progress,
         Processes(directory / "logs") as processes,
     ):
