@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from biped_mfpt_ros.bench import __main__ as bench
-from biped_mfpt_ros.bench import step_map
+from biped_mfpt_ros.bench import chain, step_map
 
 
 def test_short_benchmarks(capsys):
@@ -27,3 +27,12 @@ def test_a_wrong_result_is_an_error(capsys, monkeypatch):
     monkeypatch.setattr(step_map, "simulate_steps", wrong)
     assert bench.main(["--short", "--only", "step map"]) == 1
     assert "error" in capsys.readouterr().err
+
+
+def test_chains_of_the_benchmark_settle_and_are_exact():
+    # 10000 states once made a chain that takes thousands of steps, which only the full run saw.
+    for states in (1, 2_000, 10_000):
+        mesh = chain.chain_mesh(states)
+        assert mesh.targets[1, len(mesh.slopes) // 2] == 1  # x_2, on flat ground
+        sigmas = chain._SIGMAS[[0, 1, 25, 49]]
+        assert chain.check_chain(chain._solved(mesh, sigmas), sigmas) < 1e-10

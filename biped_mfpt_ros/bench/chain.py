@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import os
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from scipy.spatial import cKDTree
 from biped_mfpt_ros.bench.measure import SLOPES, BenchError, Section, row, timed
 from biped_mfpt_ros.bench.step_map import reached
 from biped_mfpt_ros.chain.markov import (
+    ChainError,
     Metastability,
     metastabilities,
     slope_probabilities,
@@ -42,7 +44,7 @@ from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
 
 _HALF, _CONTRACTION = 30, 0.85
-_REACHED = 1.0  # share of the copies that are found
+_REACHED = 0.752  # share of the copies that are found
 _SIGMAS = np.radians(np.geomspace(1.2, 8.0, 50))  # MFPT from 65 to some 1e38
 
 
@@ -66,8 +68,9 @@ def _copied(small, copies, number, queue, targets):
     They are numbered as they are found; `queue` and `number` are the way from there and back.
     """
     m = small.shape[1]
-    queue[1] = copies
-    number[copies] = 1
+    # x_2 walks on flat ground, slope m // 2, and comes to itself.
+    queue[1] = copies + (copies - 1) // 2
+    number[queue[1]] = 1
     found = 2
     i = 1
     while i < found:
@@ -89,7 +92,9 @@ def chain_mesh(states: int) -> Mesh:
     """A mesh with a chain of about so many states; where the states are is of no account."""
     small = small_chain()
     m = small.shape[1]
-    copies = max(1, round(states / _REACHED / (len(small) - 1)))
+    # Odd multiples of m, or one: of other numbers some take thousands of steps to forget the copy.
+    pieces = round(states / _REACHED / (len(small) - 1) / m)
+    copies = (pieces | 1) * m if pieces else 1
     most = len(small) * copies
     targets = np.zeros((most, m), dtype=np.uint32)
     number, queue = np.zeros(most, dtype=np.uint32), np.empty(most, dtype=np.int64)
@@ -111,8 +116,14 @@ def chain_mesh(states: int) -> Mesh:
 
 
 def _solved(mesh: Mesh, sigmas: np.ndarray, threads: int | None = None) -> list[Metastability]:
-    found = metastabilities(mesh, 0.0, sigmas, threads=threads)
-    return [result for result in found if isinstance(result, Metastability)]
+    out = []
+    for sigma, result in zip(
+        sigmas, metastabilities(mesh, 0.0, sigmas, threads=threads), strict=True
+    ):
+        if isinstance(result, ChainError):
+            raise BenchError(f"chain of {len(mesh.states)} states, sigma_s {sigma:g} rad: {result}")
+        out.append(result)
+    return out
 
 
 def check_chain(found: list[Metastability], sigmas: np.ndarray) -> float:
@@ -281,7 +292,13 @@ def search(
             row(f"{n} states: scipy's trees built once, a state", seconds["built"], n, "us"),
         ]
     )
-    peak = peak_of(grown)
+    # Counted by allocation: what the process holds does not show memory that is used again.
+    tracemalloc.start()
+    try:
+        grown()
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
     section.facts[f"{n} states: peak memory of the set, bytes a state"] = round(peak / n)
     medians = {name: float(np.median(values)) for name, values in seconds.items()}
     section.ratios[f"scipy_over_nearest_{states}"] = medians["trees"] / medians["nearest"]
