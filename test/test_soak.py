@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import mmap
 import time
 from contextlib import nullcontext
 from random import Random
@@ -63,8 +64,14 @@ def test_the_fuzzer_notices_what_is_wrong(monkeypatch):
 
     assert fuzz.fuzz("slow", slow, 3, 1, QUIET).failures == 3
 
+    # Pages of their own: what the allocator has kept of earlier tests would take the rest in.
     kept = []
-    leaking = fuzz.fuzz("leaking", lambda random: kept.append(b"x" * 10**6), 100, 1, QUIET)
+
+    def leak(random):
+        kept.append(mmap.mmap(-1, 10**6))
+        kept[-1].write(b"x" * 10**6)
+
+    leaking = fuzz.fuzz("leaking", leak, 100, 1, QUIET)
     assert leaking.failures == 1
     assert "grew by" in leaking.examples[0]
 

@@ -20,6 +20,7 @@ from biped_mfpt_msgs.msg import MeshInfo, MeshStates, MeshTransitions
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -47,6 +48,8 @@ class Nodes:
         self.directory = Path(self._directory.name)
         self._processes: list[subprocess.Popen[bytes]] = []
         self._context = Context()
+        # The level is the whole process's, which may go on to other things.
+        self._log_level = get_logger_level("")
         rclpy.init(
             args=["--ros-args", "--disable-external-lib-logs", "--log-level", "error"],
             context=self._context,
@@ -89,6 +92,7 @@ class Nodes:
         self._grow.destroy()
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
+        set_logger_level("", self._log_level)
         self._directory.cleanup()
 
     def start(
