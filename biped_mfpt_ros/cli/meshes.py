@@ -50,15 +50,16 @@ def mesh(args: argparse.Namespace) -> None:
 
 def mfpt(args: argparse.Namespace) -> None:
     """Mesh a controller and compute its MFPT."""
-    from biped_mfpt_ros.chain.markov import metastability
+    from biped_mfpt_ros.chain.markov import ChainError, metastabilities
 
     mean = options.mean_of(args)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
     grown, result = grow(args)
     start = time.perf_counter()
     estimates = []
-    for sigma, sigma_deg in zip(sigmas, args.sigma, strict=True):
-        found = metastability(grown, mean, sigma)
+    for sigma_deg, found in zip(args.sigma, metastabilities(grown, mean, sigmas), strict=True):
+        if isinstance(found, ChainError):
+            raise found
         estimates.append(
             estimate_row(args.controller, args.mean, sigma_deg, found, found.failure_shares)
         )
