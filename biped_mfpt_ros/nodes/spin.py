@@ -15,7 +15,11 @@ from types import FrameType
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions, install_signal_handlers
+from rclpy.signals import (
+    SignalHandlerOptions,
+    install_signal_handlers,
+    uninstall_signal_handlers,
+)
 
 from biped_mfpt_ros.errors import InputError
 
@@ -113,16 +117,18 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
     node: Node | None = None
+    executor: SingleThreadedExecutor | None = None
     try:
         prepare_environment()
         keep_freed_memory()
         with security_explained():
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
             node = make()
+        executor = SingleThreadedExecutor()
         install_signal_handlers(SignalHandlerOptions.ALL)
         # What is raised inside a callback of the compiler is swallowed there.
         if not interrupt.received:
-            _spin(node)
+            _spin(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except InputError as error:
@@ -130,10 +136,16 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
         return 2
     finally:
         interrupt.hold = True  # cleaning up is not to be cut off
+        # A thread of rclpy tells of the signal, to the executor among others, and may be slower
+        # than what it woke: this waits for its end. Only then may anything be destroyed.
+        uninstall_signal_handlers()
         if node is not None:
             close = getattr(node, "close", None)
             if close is not None:
                 close()
+        if executor is not None:
+            executor.shutdown()
+        if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
         # Else the interpreter looks through all of numba's objects once more before it ends.
@@ -141,9 +153,8 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
     return 0
 
 
-def _spin(node: Node) -> None:
+def _spin(node: Node, executor: SingleThreadedExecutor) -> None:
     """Spin until the context ends. What goes wrong with one caller must not end the node."""
-    executor = SingleThreadedExecutor()
     executor.add_node(node)
     while node.context.ok():
         try:
