@@ -2,6 +2,8 @@
 
 import signal
 import subprocess
+import sys
+import time
 
 import pytest
 from action_msgs.msg import GoalStatus
@@ -158,3 +160,15 @@ def test_a_signal_during_the_start_stops_cleanly(graph, client, number):
     wait_for(lambda: any(node.endswith(name) for node in client.get_node_names()), "the node")
     code, written = stop(process, number)
     assert code == 0, written
+
+
+def test_a_process_ends_in_time_whatever_holds_the_interpreter():
+    # The search holds the interpreter's lock, and would take years.
+    code = (
+        "import re; from biped_mfpt_ros.nodes.spin import end_within; end_within(1); "
+        "re.match('(a+)+b', 'a' * 60)"
+    )
+    start = time.monotonic()
+    ended = subprocess.run([sys.executable, "-c", code], timeout=20.0, check=False)
+    assert ended.returncode == 0
+    assert time.monotonic() - start > 1.0

@@ -23,6 +23,9 @@ from rclpy.signals import (
 
 from biped_mfpt_ros.errors import InputError
 
+_LAST_SECONDS = 3
+"""s, for the middleware to end in."""
+
 # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h. The first is the most that glibc
 # takes; the others bound what a heap keeps.
 _MALLOC = ((-3, 32 << 20), (-1, 64 << 20), (-2, 4 << 20))
@@ -62,6 +65,44 @@ def keep_freed_memory() -> None:
     if allocator is not None:
         for option, size in _MALLOC:
             allocator(option, size)
+
+
+class _Event(ctypes.Structure):
+    """``sigevent`` of signal.h, of 64 bytes."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("rest", ctypes.c_char * 40),
+    )
+
+
+def end_within(seconds: int) -> None:
+    """End the process with exit code 0 after a time, whatever it does then.
+
+    Fast DDS can lock itself up while it leaves the graph, when others leave at the same moment:
+    its participant waits, busily, for a callback that waits for the participant. It holds the
+    interpreter's lock meanwhile, so no thread of Python can help, and no handler of a signal. A
+    timer of the C library calls ``_exit(0)`` from a thread of its own.
+
+    Parameters
+    ----------
+    seconds : int
+        s, from now.
+    """
+    library = ctypes.CDLL(None)
+    create, start = (getattr(library, f"timer_{name}", None) for name in ("create", "settime"))
+    if create is None or start is None:
+        return
+    sigev_thread, monotonic = 2, 1
+    function = ctypes.cast(library._exit, ctypes.c_void_p)
+    event = _Event(value=0, notify=sigev_thread, function=function)
+    timer = ctypes.c_void_p()
+    if create(monotonic, ctypes.byref(event), ctypes.byref(timer)) == 0:
+        # Interval and first expiry, each in s and ns.
+        start(timer, 0, (ctypes.c_long * 4)(0, 0, seconds, 0), None)
 
 
 @contextmanager
@@ -143,6 +184,7 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
             close = getattr(node, "close", None)
             if close is not None:
                 close()
+            end_within(_LAST_SECONDS)
         if executor is not None:
             executor.shutdown()
         if node is not None:
