@@ -53,3 +53,10 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
 
 kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 """Decorator of every numeric kernel: compiled once, cached on disk, run without the GIL."""
+
+inner_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+"""The same for kernels that neither allocate nor return arrays: they do not count references.
+
+Numba counts them, atomically, for every array that is passed on; in the many small kernels of the
+step map that was a third of the time. Whoever calls from outside holds the arrays meanwhile.
+"""

@@ -33,7 +33,7 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import binary_exponent, mantissa, power_of_two, select
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot
@@ -90,7 +90,7 @@ _LOG = tuple(2.0 / math.log(2.0) / n for n in range(1, 22, 2))
 _EXP = tuple(math.log(2.0) ** n / math.factorial(n) for n in range(14))
 
 
-@kernel
+@inner_kernel
 def power(x, p):
     """``x^p`` for x >= 0, to some 1e-14 relative for results of ordinary size.
 
@@ -116,12 +116,12 @@ def power(x, p):
     return series * power_of_two(n)
 
 
-@kernel
+@inner_kernel
 def _with_sign(size, x):
     return select(x < 0.0, -size, size)
 
 
-@kernel
+@inner_kernel
 def _slow(rate, k, exponent, width):
     """Where the law is about ``rate``, and whether there is such a sigma."""
     size = abs(rate)
@@ -132,7 +132,7 @@ def _slow(rate, k, exponent, width):
     return rate / STEEPEST, linear
 
 
-@kernel
+@inner_kernel
 def _manifold(rate, k, exponent):
     """The slow manifold of eq. (21) to first order: sigma, and its slope over ``rate`` (s)."""
     if exponent > 0.0:
@@ -143,7 +143,7 @@ def _manifold(rate, k, exponent):
     return 0.0 * rate, 0.0 * rate
 
 
-@kernel
+@inner_kernel
 def _law(sigma, rate, k, exponent, width):
     """-v of eq. (21) for one output; ``rate`` is dh / tau.
 
@@ -160,7 +160,7 @@ def _law(sigma, rate, k, exponent, width):
     return select(bounded, rate + _with_sign(bound, excess), law)
 
 
-@kernel
+@inner_kernel
 def _sliding(sigma, rate, inverse_tau, k, exponent):
     """-v of an output that slides.
 
@@ -176,7 +176,7 @@ def _sliding(sigma, rate, inverse_tau, k, exponent):
     return rate / (1.0 - g) + DRIFT * (sigma - slow)
 
 
-@kernel
+@inner_kernel
 def _output(par, i, switched, slides, value, rate):
     """Acceleration of one output (eq. 18, 21); ``switched`` and ``slides`` are 0 or 1."""
     inverse_tau = par[_RATE + i]
@@ -189,7 +189,7 @@ def _output(par, i, switched, slides, value, rate):
     return -select(slides > 0.5, along, law)
 
 
-@kernel
+@inner_kernel
 def command(par, a, da, switched, slides):
     """Accelerations ``alpha + beta z`` of the five links, ``z`` that of the stance femur.
 
@@ -204,7 +204,7 @@ def command(par, a, da, switched, slides):
     return (zero, v2, v3, v2 + v4, v5), (one, zero, one, zero, zero)
 
 
-@kernel
+@inner_kernel
 def off_slide(par, i, a, da, switched):
     """How far an output is from where it begins to slide; it does at zero and below.
 
@@ -232,7 +232,7 @@ def off_slide(par, i, a, da, switched):
     return max(abs(law - slow_rate) / near, slope * STIFF) - 1.0
 
 
-@kernel
+@inner_kernel
 def switch(par, a):
     """Positive before the switch of the references: theta_1 - pi (eq. 22)."""
     return a[0] - math.pi

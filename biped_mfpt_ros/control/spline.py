@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot
 
@@ -53,7 +53,7 @@ PACKED_SIZE = _PIECE + _PIECES * 16
 _BASIS = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
 
 
-@kernel
+@inner_kernel
 def _output(par, i, piece, at, rate, value, value_rate):
     """Acceleration ``alpha + first z`` of one output."""
     k = _PIECE + 16 * piece + 4 * i
@@ -69,7 +69,7 @@ def _output(par, i, piece, at, rate, value, value_rate):
     return alpha, first
 
 
-@kernel
+@inner_kernel
 def command(par, a, da):
     """Accelerations ``alpha + beta z`` of the five links with ``z = ddtheta``."""
     rate = -0.5 * (da[0] + da[2])

@@ -16,13 +16,13 @@ from __future__ import annotations
 from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.control.controller import HZD, SMC
 from biped_mfpt_ros.gait.scratch import COMMAND, CUT, MODE, SLIDES, SPARE, SWITCHED
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker import robot as r
 
 
-@kernel
+@inner_kernel
 def _command(scheme, par, w, row, a, da, switched, slides):
     """Accelerations ``alpha + beta z`` that the controller wants, for the states in a row."""
     if scheme == HZD:
@@ -37,7 +37,7 @@ def _command(scheme, par, w, row, a, da, switched, slides):
     return angles(w, COMMAND), rates(w, COMMAND)
 
 
-@kernel
+@inner_kernel
 def switch(scheme, par, a):
     """Positive before the controller's switch, negative after it."""
     if scheme == HZD:
@@ -47,38 +47,38 @@ def switch(scheme, par, a):
     return 1.0 + 0.0 * a[0]
 
 
-@kernel
+@inner_kernel
 def angles(w, row):
     """Five angles in all lanes."""
     return (load(w, row, 0), load(w, row, 1), load(w, row, 2), load(w, row, 3), load(w, row, 4))
 
 
-@kernel
+@inner_kernel
 def rates(w, row):
     """Five rates in all lanes."""
     return (load(w, row, 5), load(w, row, 6), load(w, row, 7), load(w, row, 8), load(w, row, 9))
 
 
-@kernel
+@inner_kernel
 def lane_angles(w, row, lane):
     """Five angles in one lane."""
     return (w[row, 0, lane], w[row, 1, lane], w[row, 2, lane], w[row, 3, lane], w[row, 4, lane])
 
 
-@kernel
+@inner_kernel
 def lane_rates(w, row, lane):
     """Five rates in one lane."""
     return (w[row, 5, lane], w[row, 6, lane], w[row, 7, lane], w[row, 8, lane], w[row, 9, lane])
 
 
-@kernel
+@inner_kernel
 def _wanted(rob, s, c, da, alpha, beta):
     """Accelerations and torques that the controller wants."""
     dda = dynamics.prescribed_motion(rob, s, c, da, alpha, beta)
     return dda, dynamics.required_torques(rob, s, c, da, dda)
 
 
-@kernel
+@inner_kernel
 def _applied(rob, cut, off, wanted):
     """Torques that act: wanted, at the limit where ``cut`` is not 0, or none where ``off``."""
     limit = rob[r.TORQUE_LIMIT]
@@ -90,12 +90,12 @@ def _applied(rob, cut, off, wanted):
     )
 
 
-@kernel
+@inner_kernel
 def _is_cut(cut, off):
     return (cut[0] != 0.0) | (cut[1] != 0.0) | (cut[2] != 0.0) | (cut[3] != 0.0) | off
 
 
-@kernel
+@inner_kernel
 def powers(u, da):
     """Mechanical power of the joints, W."""
     return (
@@ -106,13 +106,13 @@ def powers(u, da):
     )
 
 
-@kernel
+@inner_kernel
 def _off(scheme, switched):
     """Whether the controller has switched the torques off."""
     return switched > (0.5 if scheme == HZD else 2.0)
 
 
-@kernel
+@inner_kernel
 def mode_of_all(w):
     """Of all lanes: torques cut off, whether the controller has switched, which outputs slide."""
     return (
@@ -132,7 +132,7 @@ def mode_of_all(w):
     )
 
 
-@kernel
+@inner_kernel
 def mode_of(w, lane):
     """The same of one lane, in all lanes."""
     return (
@@ -152,7 +152,7 @@ def mode_of(w, lane):
     )
 
 
-@kernel
+@inner_kernel
 def motion(scheme, rob, par, w, row, mode):
     """Motion under a controller, with a given set of torques cut off (eq. 2, 8, 16).
 
@@ -197,7 +197,7 @@ def motion(scheme, rob, par, w, row, mode):
     return dda, wanted, applied, dynamics.ground_force(rob, s, c, da, dda), s, c
 
 
-@kernel
+@inner_kernel
 def beyond(rob, cut, wanted):
     """How far the wanted torques are beyond where ``cut`` is right, at most, N m."""
     limit = rob[r.TORQUE_LIMIT]
@@ -210,14 +210,14 @@ def beyond(rob, cut, wanted):
     return select(u2 > u0, u2, u0)
 
 
-@kernel
+@inner_kernel
 def cut_off(rob, wanted):
     """Whether a torque is beyond the limit: 0 or its sign."""
     limit = rob[r.TORQUE_LIMIT]
     return select(wanted > limit, 1.0, select(wanted < -limit, -1.0, 0.0))
 
 
-@kernel
+@inner_kernel
 def closed_loop(scheme, switched, rob, par, w, y, rate, torques):
     """Time derivative of angles, rates and energy under a controller, for integrators of others.
 
@@ -261,7 +261,7 @@ def closed_loop(scheme, switched, rob, par, w, y, rate, torques):
         torques[i] = lane_of(applied[i], 0)
 
 
-@kernel
+@inner_kernel
 def margin(rob, force):
     """How far the stance foot is from slipping, N: negative slips (eq. 4)."""
     return rob[r.FRICTION] * force[1] - abs(force[0])

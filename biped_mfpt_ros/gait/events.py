@@ -19,7 +19,7 @@ from biped_mfpt_ros.gait.closed_loop import (
 )
 from biped_mfpt_ros.gait.integrate import state_at
 from biped_mfpt_ros.gait.scratch import AT, FEET, MODE, PLACES, SPARE, SWITCHED, VALUE
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat, store
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.dynamics import foot, sines
@@ -33,14 +33,14 @@ CUT_RESOLUTION = 1e-9
 """Of the torque limit: how far a torque may be beyond it before it is cut off."""
 
 
-@kernel
+@inner_kernel
 def next_guess(low, low_value, high, high_value):
     """Where a function that changes sign between two places would vanish if it were linear."""
     at = low + (high - low) * (low_value / (low_value - high_value))
     return at if low < at < high else 0.5 * (low + high)
 
 
-@kernel
+@inner_kernel
 def foot_at(rob, w, lane, at):
     """Position and velocity of the swing foot at fractions in lanes: x, y (m), dx, dy (m/s)."""
     a, da = state_at(w, lane, at)
@@ -48,14 +48,14 @@ def foot_at(rob, w, lane, at):
     return foot(rob, s, c, da)
 
 
-@kernel
+@inner_kernel
 def foot_once(rob, w, lane, at):
     """The same at one fraction."""
     x, y, dx, dy = foot_at(rob, w, lane, splat(at))
     return lane_of(x, 0), lane_of(y, 0), lane_of(dx, 0), lane_of(dy, 0)
 
 
-@kernel
+@inner_kernel
 def cubic_root(f0, d0, f1, d1):
     """Where the cubic with values f0 > 0 >= f1 and slopes d0, d1 at 0 and 1 vanishes, about."""
     low, high = 0.0, 1.0
@@ -74,7 +74,7 @@ def cubic_root(f0, d0, f1, d1):
     return at
 
 
-@kernel
+@inner_kernel
 def foot_root(rob, w, lane, nx, ny, low, high, at, span):
     """Where ``nx x + ny y`` of the swing foot falls through zero, in lanes, by a guarded Newton.
 
@@ -99,14 +99,14 @@ def foot_root(rob, w, lane, nx, ny, low, high, at, span):
     return at
 
 
-@kernel
+@inner_kernel
 def root_once(rob, w, lane, nx, ny, low, high, at, span):
     """The same for one, as a number."""
     found = foot_root(rob, w, lane, splat(nx), splat(ny), splat(low), splat(high), splat(at), span)
     return lane_of(found, 0)
 
 
-@kernel
+@inner_kernel
 def foot_lowest(rob, w, lane, nx, ny, low, high):
     """Where ``nx x + ny y`` of the swing foot is least, given that it falls, then rises."""
     for _ in range(50):
@@ -119,7 +119,7 @@ def foot_lowest(rob, w, lane, nx, ny, low, high):
     return high
 
 
-@kernel
+@inner_kernel
 def may_dip(f0, d0, f1, d1):
     """Whether a smooth function with these values and slopes at 0 and 1 may fall to zero between.
 
@@ -132,7 +132,7 @@ def may_dip(f0, d0, f1, d1):
     return not least > 3e-3 + 0.1 * (most - least)
 
 
-@kernel
+@inner_kernel
 def first_below(rob, w, lane, nx, ny, offset, low, at_low, high, at_high, parts, span):
     """Between which fractions the swing foot first comes down to ``nx x + ny y = offset``.
 
@@ -171,7 +171,7 @@ def first_below(rob, w, lane, nx, ny, offset, low, at_low, high, at_high, parts,
     return 2.0, 2.0, 2.0
 
 
-@kernel
+@inner_kernel
 def switch_root(scheme, par, w, lane, switched, span):
     """Where the controller switches, as a fraction of the step: just on the far side."""
     low, high = 0.0, 1.0
@@ -193,7 +193,7 @@ def switch_root(scheme, par, w, lane, switched, span):
     return high
 
 
-@kernel
+@inner_kernel
 def motion_at(scheme, rob, par, w, lane, at):
     """Motion of one lane at fractions of the step in lanes.
 
@@ -207,7 +207,7 @@ def motion_at(scheme, rob, par, w, lane, at):
     return wanted, applied, force
 
 
-@kernel
+@inner_kernel
 def first_change(scheme, rob, par, w, lane, span):
     """When the first torque reaches its limit, or leaves it, and which.
 
@@ -269,7 +269,7 @@ def first_change(scheme, rob, par, w, lane, span):
     return at, joint, held, evaluations
 
 
-@kernel
+@inner_kernel
 def slide_root(scheme, rob, par, w, lane, i, span):
     """Where an output begins to slide, given that it does by the end of the step.
 
@@ -291,7 +291,7 @@ def slide_root(scheme, rob, par, w, lane, i, span):
     return high
 
 
-@kernel
+@inner_kernel
 def _off_slide(scheme, rob, par, w, lane, i, at):
     a, da = state_at(w, lane, splat(at))
     for k in range(5):
@@ -308,14 +308,14 @@ def _off_slide(scheme, rob, par, w, lane, i, at):
     return off
 
 
-@kernel
+@inner_kernel
 def force_once(scheme, rob, par, w, lane, at):
     """Force of the ground on the stance foot at one fraction: tangential, normal, N."""
     _, _, force = motion_at(scheme, rob, par, w, lane, splat(at))
     return lane_of(force[0], 0), lane_of(force[1], 0)
 
 
-@kernel
+@inner_kernel
 def slip_root(scheme, rob, par, w, lane, lifts, low, low_value, high, high_value, span):
     """When the stance foot begins (or ends) to slip: where the margin changes its sign.
 
@@ -344,7 +344,7 @@ def slip_root(scheme, rob, par, w, lane, lifts, low, low_value, high, high_value
     return at
 
 
-@kernel
+@inner_kernel
 def body_touches(rob, s, c, previous, slope):
     """Whether a knee, the hip or the head is below the ground; slopes as (sine, cosine)."""
     tibia, femur = rob[r.TIBIA], rob[r.FEMUR]
@@ -358,7 +358,7 @@ def body_touches(rob, s, c, previous, slope):
     )
 
 
-@kernel
+@inner_kernel
 def _below(x, y, previous, slope):
     """Whether a point is below the ground, that of the preceding slope behind the stance foot."""
     ahead = x >= 0.0
@@ -367,7 +367,7 @@ def _below(x, y, previous, slope):
     return y * cosine - x * sine <= 0.0
 
 
-@kernel
+@inner_kernel
 def body_touches_at(rob, w, lane, at, previous, slope):
     """The same at a fraction of the step."""
     a, _ = state_at(w, lane, splat(at))
@@ -377,7 +377,7 @@ def body_touches_at(rob, w, lane, at, previous, slope):
     return any_lane(body_touches(rob, s, c, behind, ahead))
 
 
-@kernel
+@inner_kernel
 def body_root(rob, w, lane, previous, slope, high):
     """When a body point first goes below the ground, given that it does at ``high``."""
     low = 0.0

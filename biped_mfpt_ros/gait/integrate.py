@@ -48,7 +48,7 @@ from biped_mfpt_ros.gait.scratch import (
     H,
     Y,
 )
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import load, select, store
 from biped_mfpt_ros.walker import robot as r
 
@@ -286,7 +286,7 @@ _FROM = np.array([j for stage in _STAGES for j, _ in stage])
 _WEIGHT = np.array([weight for stage in _STAGES for _, weight in stage])
 
 
-@kernel
+@inner_kernel
 def _stage(scheme, rob, par, w, h, stage, into, columns, mode):
     """One stage, in all lanes: its state into a row, its derivative into one of its own."""
     for i in range(columns):
@@ -306,7 +306,7 @@ def _stage(scheme, rob, par, w, h, stage, into, columns, mode):
     return wanted, force, s, c
 
 
-@kernel
+@inner_kernel
 def trial_step(scheme, rob, par, w):
     """Try a step in all lanes, from row Y, whose derivative stands in row STAGE, to row Y_NEW.
 
@@ -356,7 +356,7 @@ def trial_step(scheme, rob, par, w):
     store(w, ESTIMATE, ERROR_3, order_3)
 
 
-@kernel
+@inner_kernel
 def estimated_error(w, lane):
     """Estimated local error of the step over the tolerance: accepted if at most 1."""
     five, three = w[ESTIMATE, ERROR_5, lane], w[ESTIMATE, ERROR_3, lane]
@@ -365,7 +365,7 @@ def estimated_error(w, lane):
     return w[MODE, H, lane] * five / math.sqrt((five + 0.01 * three) * STATES)
 
 
-@kernel
+@inner_kernel
 def prepare_dense(scheme, rob, par, w):
     """Compute the dense output of the step just tried, in all lanes."""
     mode = mode_of_all(w)
@@ -387,7 +387,7 @@ def prepare_dense(scheme, rob, par, w):
             store(w, DENSE + 3 + power, i, h * total)
 
 
-@kernel
+@inner_kernel
 def interpolate(w, lane, i, at):
     """Dense output of a column at the fraction ``at`` of the step."""
     rest = 1.0 - at
@@ -413,7 +413,7 @@ def interpolate(w, lane, i, at):
     )
 
 
-@kernel
+@inner_kernel
 def state_at(w, lane, at):
     """Angles and rates at the fraction ``at`` of the step."""
     a = (

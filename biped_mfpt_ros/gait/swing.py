@@ -118,7 +118,7 @@ from biped_mfpt_ros.gait.scratch import (
     H,
     Y,
 )
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import LANES, lane_of, load, select, splat, store
 from biped_mfpt_ros.walker import impact
 from biped_mfpt_ros.walker import robot as r
@@ -155,13 +155,13 @@ _N1, _N2, _N3 = 1.0 / 3.0, 0.6, 6.0 / 7.0  # when the integrator's stages 5, 9 a
 _NODES = (0.0, _N1, _N2, _N3, 1.0)
 
 
-@kernel
+@inner_kernel
 def _unloaded(rob):
     """N: a foot that slips under no load to speak of is one that lifts."""
     return 1e-6 * rob[r.MASS] * rob[r.GRAVITY]
 
 
-@kernel
+@inner_kernel
 def _of_lane(x, lane):
     """Five numbers of one lane."""
     return (
@@ -173,13 +173,13 @@ def _of_lane(x, lane):
     )
 
 
-@kernel
+@inner_kernel
 def _root(error):
     """By which a step of order 8 changes the error: its eighth root, the same on every machine."""
     return math.sqrt(math.sqrt(math.sqrt(error)))
 
 
-@kernel
+@inner_kernel
 def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, results):
     """Put a swing into a lane.
 
@@ -259,7 +259,7 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
     v[TODO, lane] = todo
 
 
-@kernel
+@inner_kernel
 def _restart(scheme, rob, par, w, v, lane, afresh):
     """Evaluate the closed loop at row Y, for the next step; ``afresh``: find what is cut off.
 
@@ -289,7 +289,7 @@ def _restart(scheme, rob, par, w, v, lane, afresh):
     return s, c, lane_of(force[1], lane)
 
 
-@kernel
+@inner_kernel
 def _begins_to_slide(rob, par, w, lane):
     """Whether an output may slide at the end of the step, and did not before."""
     if w[ESTIMATE, CLEARANCE, lane] > -smc.CLEAR * rob[r.TORQUE_LIMIT]:
@@ -305,7 +305,7 @@ def _begins_to_slide(rob, par, w, lane):
     return False
 
 
-@kernel
+@inner_kernel
 def _choose_slides(par, w, lane, may):
     """Put outputs into sliding mode, or take them out; returns whether any changed."""
     changed = False
@@ -324,7 +324,7 @@ def _choose_slides(par, w, lane, may):
     return changed
 
 
-@kernel
+@inner_kernel
 def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, trace):
     """One step of the integrator in all lanes, and what happens in it.
 
@@ -378,7 +378,7 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
             )
 
 
-@kernel
+@inner_kernel
 def _propose(rob, w, v, lane):
     """Limit the length of the next step, or end the swing."""
     left = rob[r.TIME_LIMIT] - v[TIME, lane]
@@ -389,7 +389,7 @@ def _propose(rob, w, v, lane):
         w[MODE, H, lane] = min(w[MODE, H, lane], _LONGEST_STEP, left + 1e-9)
 
 
-@kernel
+@inner_kernel
 def _end(v, lane, outcomes, results):
     """The slopes that are still open share the failure that ended the swing."""
     for i in range(int(v[TODO, lane])):
@@ -398,7 +398,7 @@ def _end(v, lane, outcomes, results):
         results[2, i] = v[ENERGY, lane]
 
 
-@kernel
+@inner_kernel
 def _inspect(scheme, rob, par, w, v, lane, slopes):
     """Whether the step just tried is good, and whether something may happen in it.
 
@@ -443,7 +443,7 @@ def _inspect(scheme, rob, par, w, v, lane, slopes):
     return changes or switches or slips or near or slide
 
 
-@kernel
+@inner_kernel
 def _may_reach(v, lane, nx, ny, h):
     """Whether the swing foot may come down to ``nx x + ny y = 0`` in the step."""
     f0 = nx * v[FOOT_X, lane] + ny * v[FOOT_Y, lane]
@@ -453,7 +453,7 @@ def _may_reach(v, lane, nx, ny, h):
     return may_dip(f0, d0, f1, d1)
 
 
-@kernel
+@inner_kernel
 def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trace):
     """What happens in a step that is good, and the start of the next one."""
     h, t = w[MODE, H, lane], v[TIME, lane]
@@ -526,7 +526,7 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
         v[MARGIN, lane] = margin(rob, (w[ESTIMATE, TANGENTIAL, lane], w[ESTIMATE, NORMAL, lane]))
 
 
-@kernel
+@inner_kernel
 def _growth(v, lane, h, error):
     """By which the next step may be longer, from the errors of this one and the one before.
 
@@ -544,7 +544,7 @@ def _growth(v, lane, h, error):
     return factor
 
 
-@kernel
+@inner_kernel
 def _cut_short(rob, w, v, lane, end):
     """End the step at a fraction of it."""
     at = splat(end)
@@ -558,7 +558,7 @@ def _cut_short(rob, w, v, lane, end):
     v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane] = x, y, dx, dy
 
 
-@kernel
+@inner_kernel
 def _first_fall(scheme, rob, par, w, v, lane, end, h):
     """When the stance foot has slipped long enough, or lifts: a fraction of the step, an outcome.
 
@@ -603,7 +603,7 @@ def _first_fall(scheme, rob, par, w, v, lane, end, h):
     return end, -1
 
 
-@kernel
+@inner_kernel
 def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failure):
     """Where the swing foot and the body meet the ground before ``stop``.
 
@@ -694,7 +694,7 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
     return stop, failure
 
 
-@kernel
+@inner_kernel
 def _passing(rob, w, lane, side, at_start, at_end, end, h):
     """When the swing foot passes the stance foot, from ``side`` of it (1: from ahead)."""
     f0, f1 = side * at_start[0], side * at_end[0]
@@ -702,7 +702,7 @@ def _passing(rob, w, lane, side, at_start, at_end, end, h):
     return root_once(rob, w, lane, side, 0.0, 0.0, end, end * cubic_root(f0, d0, f1, d1), h)
 
 
-@kernel
+@inner_kernel
 def _land(rob, w, v, lane, back, h):
     """Impacts on several slopes at once, which stand in the row PLACES; sets row IMPACTS too."""
     nx, ny = load(w, PLACES, NORMAL_X), load(w, PLACES, NORMAL_Y)
@@ -728,7 +728,7 @@ def _land(rob, w, v, lane, back, h):
     store(w, PLACES, ENERGY_AT, _energy(w, v, lane, at))
 
 
-@kernel
+@inner_kernel
 def _outcome(rob, w, place, slope, after):
     """Outcome of an impact in the row IMPACTS; sets ``after``, in absolute angles."""
     sine, cosine = slope
@@ -755,7 +755,7 @@ def _outcome(rob, w, place, slope, after):
     return _STEP
 
 
-@kernel
+@inner_kernel
 def to_joint(absolute, state):
     """Absolute angles and rates as a state ``[q, dq]``."""
     for o in (0, 5):
@@ -767,7 +767,7 @@ def to_joint(absolute, state):
         state[o + 4] = torso
 
 
-@kernel
+@inner_kernel
 def _find_lobes(w, lane):
     """Find where the power of a joint changes its sign, and the joint's work up to there.
 
@@ -818,7 +818,7 @@ def _find_lobes(w, lane):
                     found += 1
 
 
-@kernel
+@inner_kernel
 def _energy(w, v, lane, at):
     """Energy spent up to fractions of the step in lanes, J (eq. 36)."""
     total = splat(v[ENERGY, lane])
@@ -835,7 +835,7 @@ def _energy(w, v, lane, at):
     return total
 
 
-@kernel
+@inner_kernel
 def _energy_at_end(w, v, lane, end):
     """The same at the end of the step, with its works in row Y_NEW."""
     total = v[ENERGY, lane]
@@ -850,7 +850,7 @@ def _energy_at_end(w, v, lane, end):
     return total
 
 
-@kernel
+@inner_kernel
 def _sample(scheme, rob, par, w, v, trace, until):
     """Samples of lane 0 up to a fraction of the step, into the trace."""
     samples = int(v[SAMPLES, 0])

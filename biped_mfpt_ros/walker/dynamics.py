@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import select
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.robot import ABSOLUTE, C, Robot, W, WalkerModel
@@ -39,7 +39,7 @@ _C3, _C4, _C5 = 2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.1666666
 _ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to an integer
 
 
-@kernel
+@inner_kernel
 def sine_cosine(angle):
     """Sine and cosine at once, to within 2 units in the last place for angles up to 1e5 rad.
 
@@ -60,7 +60,7 @@ def sine_cosine(angle):
     return s, c
 
 
-@kernel
+@inner_kernel
 def sines(a):
     """Sines and cosines of five angles."""
     s0, c0 = sine_cosine(a[0])
@@ -71,7 +71,7 @@ def sines(a):
     return (s0, s1, s2, s3, s4), (c0, c1, c2, c3, c4)
 
 
-@kernel
+@inner_kernel
 def coupling(rob, x):
     """``C x`` for five numbers, one for each link."""
     x0, x1, x2, x3, x4 = x
@@ -86,7 +86,7 @@ def coupling(rob, x):
     )
 
 
-@kernel
+@inner_kernel
 def weighted(rob, x):
     """``sum_i w_i x_i`` for five numbers, one for each link."""
     return (
@@ -98,7 +98,7 @@ def weighted(rob, x):
     )
 
 
-@kernel
+@inner_kernel
 def _foot_acceleration(s, c, da, dda):
     """Second derivatives of the five ``-e(a_i)``: tuples of x and of y."""
     q0, q1, q2 = da[0] * da[0], da[1] * da[1], da[2] * da[2]
@@ -120,14 +120,14 @@ def _foot_acceleration(s, c, da, dda):
     return x, y
 
 
-@kernel
+@inner_kernel
 def ground_force(rob, s, c, da, dda):
     """Force of the ground on the stance foot in the vertical frame: tangential, normal, N."""
     x, y = _foot_acceleration(s, c, da, dda)
     return -weighted(rob, x), rob[r.MASS] * rob[r.GRAVITY] - weighted(rob, y)
 
 
-@kernel
+@inner_kernel
 def required_torques(rob, s, c, da, dda):
     """Torques u1 to u4 for given accelerations, N m."""
     x, y = _foot_acceleration(s, c, da, dda)
@@ -141,7 +141,7 @@ def required_torques(rob, s, c, da, dda):
     return (q0 + q2, q1 + q3, q2, q3)
 
 
-@kernel
+@inner_kernel
 def prescribed_motion(rob, s, c, da, alpha, beta):
     """Accelerations ``alpha + beta z`` that fulfil the torque-free equation, rad/s^2.
 
@@ -175,7 +175,7 @@ def prescribed_motion(rob, s, c, da, alpha, beta):
     )
 
 
-@kernel
+@inner_kernel
 def solve(rob, s, c, right):
     """Solve ``D x = right``, D the inertia matrix, by an L D L^T factorisation.
 
@@ -221,7 +221,7 @@ def solve(rob, s, c, right):
     return (x0, x1, x2, x3, x4)
 
 
-@kernel
+@inner_kernel
 def free_motion(rob, s, c, da, u):
     """Accelerations under the torques u1 to u4 (eq. 2), rad/s^2."""
     qc = (
@@ -251,7 +251,7 @@ def free_motion(rob, s, c, da, u):
     return solve(rob, s, c, right)
 
 
-@kernel
+@inner_kernel
 def foot(rob, s, c, da):
     """Position and velocity of the swing foot from the stance foot: x, y (m), dx, dy (m/s)."""
     femur, tibia = rob[r.FEMUR], rob[r.TIBIA]
@@ -263,7 +263,7 @@ def foot(rob, s, c, da):
     )
 
 
-@kernel
+@inner_kernel
 def swing_foot(rob, y):
     """Position and velocity of the swing foot, for angles and rates in an array."""
     s, c = sines((y[0], y[1], y[2], y[3], y[4]))

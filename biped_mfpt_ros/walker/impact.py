@@ -14,19 +14,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.dynamics import coupling, sines, solve, to_absolute, to_joint, weighted
 from biped_mfpt_ros.walker.robot import Robot, WalkerModel
 
 
-@kernel
+@inner_kernel
 def swapped(x):
     """Five numbers with the legs' roles exchanged."""
     return (x[1], x[0], x[3], x[2], x[4])
 
 
-@kernel
+@inner_kernel
 def impact(rob, s, c, da):
     """Impact of the swing foot, in absolute angles.
 
