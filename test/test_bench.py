@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from biped_mfpt_ros.bench import __main__ as bench
 from biped_mfpt_ros.bench import chain, step_map
+from biped_mfpt_ros.bench.measure import BenchError
 
 
 def test_short_benchmarks(capsys):
@@ -27,6 +30,14 @@ def test_a_wrong_result_is_an_error(capsys, monkeypatch):
     monkeypatch.setattr(step_map, "simulate_steps", wrong)
     assert bench.main(["--short", "--only", "step map"]) == 1
     assert "error" in capsys.readouterr().err
+
+
+def test_another_swing_for_scipy_is_an_error(monkeypatch):
+    *swings, durations = step_map.swings_of("hzd/base")
+    assert durations.min() < 0.1 < 0.6 < durations.max()  # early falls, and last impacts
+    monkeypatch.setattr(step_map, "swings_of", lambda name: (*swings, durations + 1e-3))
+    with pytest.raises(BenchError, match="hzd/base: scipy ends"):
+        step_map.scipy_swings("hzd/base", 1)
 
 
 def test_chains_of_the_benchmark_settle_and_are_exact():
