@@ -110,6 +110,11 @@ class TestProgress:
         progress.count("walks", 300, 1000, "walks")
         # 200 in 2 s, so 700 more take 7 s.
         assert "walks: 300 of 1000 walks, 100/s, 7.0 s left" in stream.getvalue()
+        clock.now += 20.0
+        progress.count("meshes", 0, 50, "meshes")
+        clock.now += 2.0
+        progress.count("meshes", 10, 50, "meshes")
+        assert "meshes: 10 of 50 meshes, 5/s, 8.0 s left" in stream.getvalue()
 
     def test_mesh_has_no_time_left_while_it_grows(self):
         mesh = MeshProgress()

@@ -53,7 +53,7 @@ class Progress:
         # A terminal gets its line at once; a log only if the work turns out to be long.
         self._next = self._start if self._terminal else self._start + self._interval
         self._shown = False
-        self._counted: tuple[float, int] | None = None
+        self._counted: tuple[str, float, int] | None = None
 
     @property
     def seconds(self) -> float:
@@ -77,10 +77,11 @@ class Progress:
 
     def count(self, label: str, done: int, total: int, unit: str) -> None:
         """Show ``done`` out of a known ``total``, the rate and the time left."""
-        # From the first call on: before that something else was done, such as compiling.
+        # From the label's first call on: before that something else was done, such as compiling.
         now = time.monotonic()
-        self._counted = self._counted or (now, done)
-        since, before = self._counted
+        if self._counted is None or self._counted[0] != label:
+            self._counted = label, now, done
+        _, since, before = self._counted
         text = f"{label}: {done} of {total} {unit}"
         if done > before and now > since:
             rate = (done - before) / (now - since)
