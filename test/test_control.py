@@ -132,6 +132,10 @@ def test_sliding_mode_leaves_the_law_of_the_paper(name, switched):
     assert compared > 200
 
 
+def law(sigma, rate, k, exponent, width):
+    return smc._law(sigma, rate, smc._distance(rate, k, exponent), k, exponent, width)
+
+
 def test_sliding_mode_near_sigma_zero_rests_on_its_slow_manifold():
     """There v = -dh / tau, so that sigma stays; and the law is odd and finite everywhere."""
     k = 50.0
@@ -139,11 +143,11 @@ def test_sliding_mode_near_sigma_zero_rests_on_its_slow_manifold():
         width = (k / smc.STEEPEST) ** (1 / (1 - exponent))
         for rate in (0.0, 1e-3, 0.5, 5.0):
             slow = (rate / k) ** (1 / exponent) if exponent > 0 else rate / smc.STEEPEST
-            assert smc._law(slow, rate, k, exponent, width) == pytest.approx(rate, abs=1e-9)
+            assert law(slow, rate, k, exponent, width) == pytest.approx(rate, abs=1e-9)
             for sigma in (0.0, 1e-12, 1e-6, 1e-3, 0.1, 3.0):
-                value = smc._law(sigma, rate, k, exponent, width)
+                value = law(sigma, rate, k, exponent, width)
                 assert math.isfinite(value)
-                assert smc._law(-sigma, -rate, k, exponent, width) == -value
+                assert law(-sigma, -rate, k, exponent, width) == -value
 
 
 @pytest.mark.parametrize("exponent", [0.4, 0.2])
@@ -161,14 +165,16 @@ def test_an_output_that_slides_settles_as_the_law_of_the_paper_has_it(exponent):
         return [y[1], -k * abs(sigma) ** exponent * np.sign(sigma)]
 
     def reaching(t, y):
-        return [y[1], -smc._law(y[1] + y[0] / tau, y[1] / tau, k, exponent, width)]
+        return [y[1], -law(y[1] + y[0] / tau, y[1] / tau, k, exponent, width)]
 
     def sliding(t, y):
-        return [y[1], -smc._sliding(y[1] + y[0] / tau, y[1] / tau, 1 / tau, k, exponent)]
+        rate = y[1] / tau
+        distance = smc._distance(rate, k, exponent)
+        return [y[1], -smc._sliding(y[1] + y[0] / tau, rate, distance, 1 / tau, exponent)]
 
     def arrived(t, y):
         rate = y[1] / tau
-        _, slope = smc._manifold(rate, k, exponent)
+        slope = smc._slope(rate, smc._distance(rate, k, exponent), exponent)
         off = abs(reaching(t, y)[1] + rate) / smc.SLIDING_RATE
         return max(off / smc.ENTRY, slope * smc.STIFF) - 1.0
 

@@ -122,30 +122,35 @@ def _with_sign(size, x):
 
 
 @inner_kernel
-def _slow(rate, k, exponent, width):
+def _distance(rate, k, exponent):
+    """``|sigma|`` on the slow manifold of eq. (21) to first order, where the law is ``rate``."""
+    if exponent > 0.0:
+        return power(abs(rate) / k, 1.0 / exponent)
+    return 0.0 * rate
+
+
+@inner_kernel
+def _slow(rate, distance, exponent, width):
     """Where the law is about ``rate``, and whether there is such a sigma."""
     size = abs(rate)
-    linear = size <= STEEPEST * width
     if exponent > 0.0:
-        return _with_sign(power(size / k, 1.0 / exponent), rate), size == size
+        return _with_sign(distance, rate), size == size
     # Faster than the law ever is, it does not slide: sigma = 0 is only crossed.
-    return rate / STEEPEST, linear
+    return rate / STEEPEST, size <= STEEPEST * width
 
 
 @inner_kernel
-def _manifold(rate, k, exponent):
-    """The slow manifold of eq. (21) to first order: sigma, and its slope over ``rate`` (s)."""
+def _slope(rate, distance, exponent):
+    """Slope of the slow manifold over ``rate``, s."""
+    size = abs(rate)
     if exponent > 0.0:
-        size = abs(rate)
-        sigma = power(size / k, 1.0 / exponent)
-        slope = select(size > 1e-12, sigma / (exponent * size), 0.0)
-        return _with_sign(sigma, rate), slope
-    return 0.0 * rate, 0.0 * rate
+        return select(size > 1e-12, distance / (exponent * size), 0.0)
+    return 0.0 * rate
 
 
 @inner_kernel
-def _law(sigma, rate, k, exponent, width):
-    """-v of eq. (21) for one output; ``rate`` is dh / tau.
+def _law(sigma, rate, distance, k, exponent, width):
+    """-v of eq. (21) for one output; ``rate`` is dh / tau, ``distance`` as of `_distance`.
 
     ``|sigma|`` is smoothed to ``(sigma^4 + width^4)^(1/4)``, so that the law is linear far below
     the width, and eq. (21) to a few parts of 1e9 at a hundred widths.
@@ -153,7 +158,7 @@ def _law(sigma, rate, k, exponent, width):
     size = sigma * sigma
     size = size * size + width * width * width * width
     law = k * sigma * power(size, 0.25 * (exponent - 1.0))
-    slow, slides = _slow(rate, k, exponent, width)
+    slow, slides = _slow(rate, distance, exponent, width)
     excess = law - rate
     bound = SLIDING_RATE * abs(sigma - slow)
     bounded = (abs(excess) > bound) & slides
@@ -161,15 +166,15 @@ def _law(sigma, rate, k, exponent, width):
 
 
 @inner_kernel
-def _sliding(sigma, rate, inverse_tau, k, exponent):
+def _sliding(sigma, rate, distance, inverse_tau, exponent):
     """-v of an output that slides.
 
     On the slow manifold ``sigma = S(rate)``, where ``-v = rate - dS/dt`` and
     ``d(rate)/dt = v / tau``. To second order in ``g = S' / tau``, of which S itself differs by a
     factor from where the law is ``rate``.
     """
-    slow, slope = _manifold(rate, k, exponent)
-    g = slope * inverse_tau
+    slow = _with_sign(distance, rate)
+    g = _slope(rate, distance, exponent) * inverse_tau
     if exponent > 0.0:
         slow = slow * (1.0 + g / exponent)
         g = g * (1.0 + (2.0 / exponent - 1.0) * g)
@@ -184,8 +189,9 @@ def _output(par, i, switched, slides, value, rate):
     sigma = rate + (value - reference) * inverse_tau
     k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
     slow_rate = rate * inverse_tau
-    law = _law(sigma, slow_rate, k, exponent, width)
-    along = _sliding(sigma, slow_rate, inverse_tau, k, exponent)
+    distance = _distance(slow_rate, k, exponent)
+    law = _law(sigma, slow_rate, distance, k, exponent, width)
+    along = _sliding(sigma, slow_rate, distance, inverse_tau, exponent)
     return -select(slides > 0.5, along, law)
 
 
@@ -222,12 +228,13 @@ def off_slide(par, i, a, da, switched):
     sigma = rate + (value - reference) * inverse_tau
     slow_rate = rate * inverse_tau
     k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
-    _, slope = _manifold(slow_rate, k, exponent)
+    distance = _distance(slow_rate, k, exponent)
+    slope = _slope(slow_rate, distance, exponent)
     g = slope * inverse_tau / exponent if exponent > 0.0 else 0.0
-    _, slides = _slow(slow_rate, k, exponent, width)
+    _, slides = _slow(slow_rate, distance, exponent, width)
     if not slides:
         return math.inf
-    law = _law(sigma, slow_rate, k, exponent, width)
+    law = _law(sigma, slow_rate, distance, k, exponent, width)
     near = SLIDING_RATE * ENTRY + 2.0 * g * abs(slow_rate)
     return max(abs(law - slow_rate) / near, slope * STIFF) - 1.0
 
