@@ -90,7 +90,7 @@ def _state(text: str) -> list[float]:
 _PAPER_CONTROLLERS = ("hzd/base", "hzd/cot", "hzd/mfpt", "smc/base", "smc/cot", "smc/mfpt")
 _TORQUE_LIMITS = (40.0, 45.0, 50.0, 55.0, 60.0, 80.0, 100.0, 120.0, 150.0, float("inf"))
 _FRICTIONS = (0.55, 0.6, 0.65, 0.7, 0.8)
-_SLIP_DURATIONS = (0.0, 0.003, 0.005, 0.008)
+_SLIP_DURATIONS = (0.0, 0.003, 0.005, 0.008, 0.012)
 _FRICTION_FRAMES = ("slope", "vertical")
 
 
@@ -248,7 +248,7 @@ many workers score them. `biped-mfpt study` lists, shows, plots and exports stud
 examples:
   biped-mfpt optimise --controller hzd/mfpt --sigma 1 --trials 1000
   biped-mfpt optimise --controller smc/base --sigma 2 --searcher pattern --fix 'k*' \\
-      --seconds 3600 --slip-duration 0.005 --torque-limit 46 --mesh 1:1 1:0.3:-0.02
+      --seconds 3600 --slip-duration 0.008 --torque-limit 45 --mesh 1:1 1:0.3:-0.02
   biped-mfpt optimise --controller hzd/base --objective mfpt cot=20 --searcher nsga2 \\
       --limit speed_min=0.6 clearance_min=0.02 --trials 2000 --study front
 """,
