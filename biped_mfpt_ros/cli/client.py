@@ -28,6 +28,9 @@ from biped_mfpt_ros.nodes.spin import security_explained
 
 _POLL = 0.05  # s
 _RESEND = 5.0  # s without an answer, after which a goal is sent again
+# What a recorder has to hear of a run: it finds each of them by itself, some tenths of a second
+# after its publisher, and a small mesh is grown and solved in less.
+_RESULTS = ("mesh/info", "mesh/states", "mesh/transitions", "mfpt")
 
 
 @dataclass(frozen=True)
@@ -115,15 +118,18 @@ class Client:
         kind = f"{SimulateSteps.__module__.split('.')[0]}/srv/{SimulateSteps.__name__}"
         here = self._node.get_namespace().rstrip("/") + "/"
         simulators = [name for name, types in services if kind in types and name.startswith(here)]
-        recorders = self._node.get_subscriptions_info_by_topic(
-            self._node.resolve_topic_name("mesh/info")
-        )
         return Peers(
             simulators=len(simulators),
             mesher=self._grow.server_is_ready(),
             analysis=self._compute.service_is_ready(),
-            recorder=any(info.node_name.startswith("recorder") for info in recorders),
+            recorder=all(map(self._is_recorded, _RESULTS)),
         )
+
+    def _is_recorded(self, topic: str) -> bool:
+        subscriptions = self._node.get_subscriptions_info_by_topic(
+            self._node.resolve_topic_name(topic)
+        )
+        return any(info.node_name.startswith("recorder") for info in subscriptions)
 
     def sees(self, node: str) -> bool:
         """Whether a node is there."""
