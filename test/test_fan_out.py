@@ -238,6 +238,42 @@ def test_answers_for_a_part_are_taken_and_the_rest_is_asked_again(swings, other)
     assert (tally.chunks_repeated > 0) == (other is silent)
 
 
+def busy_but_for(most, fake, request, answer):
+    """Has room for some requests, and refuses what comes beyond them at once."""
+    if fake.waiting >= most:
+        answer(SimulateSteps.Response(busy=True, message="busy"))
+        return
+    fake.waiting += 1
+
+    def done(response):
+        fake.waiting -= 1
+        answer(response)
+
+    good(fake, request, done, delay=0.02)
+
+
+@pytest.mark.parametrize(("room", "others"), [(1, 0), (3, 0), (0, 1), (1, 1), (3, 1)])
+def test_what_a_busy_simulator_refuses_is_asked_again(swings, room, others):
+    log = []
+    fake = Fake(busy=partial(busy_but_for, room), **{f"s{i}": good for i in range(others)})
+    fake.waiting = 0
+    settings = FanOutSettings(timeout=0.1, wait_seconds=5.0, chunk_seconds=1e-3, in_flight=6)
+    tally = run(fan_out(fake, settings, log), job_of(swings))
+    assert tally.swings == 300  # `Swings.take` sees to it that none comes twice
+    assert tally.chunks_repeated > 0
+    assert not fake.dropped
+    assert any("busy refuses: busy" in line for line in log)
+    # A simulator that has no room is not asked over and over.
+    assert fake.asked["busy"] < 2 * 300
+
+
+def test_simulators_that_stay_busy_end_the_wait(swings):
+    fake = Fake(busy=partial(busy_but_for, 0))
+    fake.waiting = 0
+    with pytest.raises(NoSimulatorError, match="busy is late"):
+        run(fan_out(fake), job_of(swings))
+
+
 @pytest.mark.parametrize(
     ("way", "dropped", "said"),
     [

@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.msg import Controller as ControllerMsg
-from biped_mfpt_msgs.srv import SimulateSteps
+from biped_mfpt_msgs.msg import MfptEstimate
+from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
 from rclpy.node import Node
 from ros_graph import Client, result_of, ros_graph, wait_for
-from test_nodes import request, settings
+from test_nodes import BASE, Publisher, ask, assert_same_mesh, grown_here, request, settings
 
-from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.nodes.analysis import Analysis
+from biped_mfpt_ros.nodes.fair_service import Waiting
 from biped_mfpt_ros.nodes.mesher import Mesher
 from biped_mfpt_ros.nodes.messages import unpacked
-from biped_mfpt_ros.nodes.qos import REQUESTS
-from biped_mfpt_ros.nodes.simulator import Simulator
+from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
+from biped_mfpt_ros.nodes.simulator import MOST_WAITING, Simulator
 
 
 @pytest.fixture
@@ -32,43 +35,165 @@ class Flooder(Node):
     def __init__(self):
         super().__init__("flooder")
 
-    def flood(self, name, asked, count):
-        client = self.create_client(SimulateSteps, name, qos_profile=REQUESTS)
+    def flood(self, name, asked, count, kind=SimulateSteps):
+        client = self.create_client(kind, name, qos_profile=REQUESTS)
         wait_for(client.service_is_ready, name)
         return [client.call_async(asked) for _ in range(count)]
 
 
-def crawling(states):
-    """Requests of the dearest kind: swings that the integrator takes in tiny steps."""
-    parameters = controller("hzd/base").parameters.copy()
-    parameters[1] = 1e5
+def mesh_of(threshold):
+    return grown_here(settings(threshold=threshold), find_limit_cycle(BASE).state)
+
+
+def dear():
+    """A request of some 30 ms: swings that the integrator takes in small steps."""
+    parameters = BASE.parameters.copy()
+    parameters[1] = 1e4
     controller_message = ControllerMsg(scheme="hzd", parameters=parameters.tolist())
+    states = np.tile(find_limit_cycle(BASE).state, (8, 1))
     return request(states, controller=controller_message)
 
 
-def test_a_flooded_simulator_answers_others_within_its_bound(graph):
-    # All services of a node share one queue, which keeps 256 requests: what a request may cost
-    # bounds how long others wait.
-    most = 20_000  # evaluations, some 10 ms
-    graph.start(Simulator, max_evaluations=most)
+def taken(waiting, seconds=0.05):
+    """All that waits, in the order in which it is served, each taking so long (s)."""
+    order = []
+    while len(waiting):
+        client, item = waiting.get()
+        waiting.charge(client, seconds)
+        order.append(item)
+    return order
+
+
+def test_clients_take_turns_and_the_greediest_is_refused():
+    waiting = Waiting(6)
+    assert [waiting.put("a", i) for i in range(4)] == [None] * 4
+    assert [waiting.put("b", 10), waiting.put("c", 20)] == [None, None]
+    assert waiting.put("a", 4) == 4  # the client with the most loses its newest
+    assert waiting.put("b", 11) == 3  # whoever asks
+    assert len(waiting) == 6
+    assert taken(waiting) == [0, 10, 20, 1, 11, 2]
+    for i in range(6):
+        assert waiting.put(f"client {i}", i) is None
+    assert waiting.put("one more", 6) == 6
+    assert taken(waiting) == [*range(6)]
+
+
+def test_clients_get_the_same_time_whatever_their_requests_cost():
+    waiting = Waiting(64)
+    costs = {"usual": 0.05, "dear": 2.0}
+    got = dict.fromkeys(costs, 0.0)
+    for client in costs:
+        waiting.put(client, None)
+    while sum(got.values()) < 100.0:
+        client, _ = waiting.get()
+        got[client] += costs[client]
+        waiting.charge(client, costs[client])
+        waiting.put(client, None)
+    assert got["usual"] == pytest.approx(got["dear"], abs=2.0)  # one dear request
+
+
+def test_a_client_pays_also_for_what_it_had_before_it_asks_again():
+    def ask_dearly():
+        waiting = Waiting(64)
+        waiting.put("dear", 0)
+        waiting.get()
+        waiting.charge("dear", 0.2)  # its turn and three more
+        return waiting
+
+    waiting = ask_dearly()
+    for i in range(4):
+        waiting.put("usual", i)
+    waiting.put("dear", 4)
+    assert taken(waiting) == [0, 1, 2, 3, 4]
+    # Time that others had meanwhile counts.
+    waiting = ask_dearly()
+    for i in range(4):
+        waiting.put("usual", i)
+    assert taken(waiting) == [0, 1, 2, 3]
+    waiting.put("usual", 5)
+    waiting.put("dear", 6)
+    waiting.put("usual", 7)
+    assert taken(waiting) == [5, 6, 7]
+
+
+def test_invented_names_keep_nobody_from_its_turn():
+    waiting = Waiting(64)
+    waiting.put("honest", 0)
+    waiting.get()
+    waiting.charge("honest", 0.2)
+    for i in range(50):
+        waiting.put(f"name {i}", 0)
+    waiting.put("honest", 1)
+    turns = 0
+    while (got := waiting.get()) != ("honest", 1):
+        waiting.charge(got[0], 0.05)
+        turns += 1
+        waiting.put(f"another name {turns}", 0)
+    assert turns <= 4 * 51
+
+
+def test_a_flood_to_a_simulator_delays_nobody_else(graph):
+    # In the order of arrival mine would wait for 64.
+    graph.start(Simulator)
     flooder, tester = graph.start(Flooder), graph.start(Client)
     simulate = tester.simulator()
     (name,) = tester.simulators()
-    states = np.tile(0.1, (500, 10))
-    start = time.monotonic()
-    assert simulate(crawling(states)).success
-    alone = time.monotonic() - start
-    sent = flooder.flood(name, crawling(states), 200)
-    start = time.monotonic()
-    mine = simulate(request(np.zeros((1, 10))))
-    waited = time.monotonic() - start
+    sent = flooder.flood(name, dear(), 200)
+    wait_for(lambda: any(future.done() for future in sent), "the flood to arrive")
+    mine = simulate(request(np.zeros((1, 10)), client="tester"))
+    served = sum(future.done() and future.result().success for future in sent)
     assert mine.success
-    assert waited < 200 * max(alone, 0.1)
-    for future in sent:
-        response = result_of(future)
-        assert response.success
-        assert response.evaluations <= most + 500_000
+    assert served < MOST_WAITING / 2
+    responses = [result_of(future) for future in sent]
+    taken = [response for response in responses if response.success]
+    assert MOST_WAITING <= len(taken) < 200
+    for response in taken:
         assert len(unpacked(response.outcomes, "B"))
+    for response in responses:
+        assert response.success != response.busy
+        assert response.success or f"at most {MOST_WAITING} requests wait" in response.message
+
+
+def test_a_mesh_goes_on_at_a_flooded_simulator(graph):
+    # There is no other one.
+    flooded = graph.start(Simulator)
+    graph.start(Mesher)
+    flooder, tester = graph.start(Flooder), graph.start(Client)
+    name = f"/{flooded.get_name()}/simulate_steps"
+    tester.wait_for_mesher()
+    sent = flooder.flood(name, dear(), 200)
+    wait_for(lambda: any(future.done() for future in sent), "the flood to arrive")
+    status, result = tester.grow(settings(threshold=1.0))
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert not all(future.done() for future in sent)
+    assert_same_mesh(tester.mesh(result.mesh_id), mesh_of(1.0))
+    for future in sent:
+        future.cancel()
+
+
+def test_a_flood_of_questions_to_the_analysis_delays_neither_meshes_nor_others(graph):
+    mesh = mesh_of(0.3)
+    graph.start(Analysis)
+    publisher = graph.start(Publisher)
+    flooder, tester = graph.start(Flooder), graph.start(Client)
+    compute = tester.service(ComputeMfpt, "compute_mfpt")
+    publisher.publish(mesh, "a")
+    wait_for(lambda: compute(ask("a")).success, "the mesh")
+    sigmas = np.linspace(0.02, 0.1, 500)
+    sent = flooder.flood("compute_mfpt", ask("a", 0.0, sigmas), 200, ComputeMfpt)
+    wait_for(lambda: any(future.done() for future in sent), "the flood to arrive")
+    estimates = []
+    tester.create_subscription(MfptEstimate, "mfpt", estimates.append, RESULTS)
+    publisher.publish(mesh, "b")
+    mine = ask("a")
+    mine.client = "tester"
+    assert compute(mine).success
+    wait_for(lambda: any(estimate.mesh_id == "b" for estimate in estimates), "the MFPT")
+    assert sum(future.done() and future.result().success for future in sent) < 32
+    responses = [result_of(future) for future in sent]
+    assert 64 <= sum(response.success for response in responses) < 200
+    for response in responses:
+        assert response.success or response.message.startswith("busy: at most 64 requests wait")
 
 
 def test_a_mesh_goes_on_beside_a_flooded_simulator(graph):
@@ -79,7 +204,7 @@ def test_a_mesh_goes_on_beside_a_flooded_simulator(graph):
     flooder, tester = graph.start(Flooder), graph.start(Client)
     wait_for(lambda: len(mesher.simulators.found()) == 2, "both simulators")
     name = f"/{flooded.get_name()}/simulate_steps"
-    sent = flooder.flood(name, crawling(np.tile(0.1, (20, 10))), 100)
+    sent = flooder.flood(name, dear(), 100)
     status, result = tester.grow(settings(threshold=1.0))
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     for future in sent:

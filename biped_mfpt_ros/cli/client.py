@@ -22,6 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from biped_mfpt_ros.cli import CommandError
+from biped_mfpt_ros.nodes.fair_service import client_name
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 from biped_mfpt_ros.nodes.spin import security_explained
@@ -69,6 +70,7 @@ class Client:
                 signal_handler_options=SignalHandlerOptions.NO,
             )
             self._node = Node("run", namespace=namespace, context=self._context)
+        self._name = client_name(self._node)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._grow = ActionClient(self._node, GrowMesh, "grow_mesh")
@@ -214,7 +216,12 @@ class Client:
     def ask_mfpt(self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]) -> Future:
         """Ask as `compute_mfpt` does, without waiting for the `answer`."""
         return self._compute.call_async(
-            ComputeMfpt.Request(mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array(sigma_s), "d"))
+            ComputeMfpt.Request(
+                mesh_id=mesh_id,
+                mu_s=mu_s,
+                sigma_s=packed(np.array(sigma_s), "d"),
+                client=self._name,
+            )
         )
 
     def answer(self, asked: Future) -> list[MfptEstimate]:

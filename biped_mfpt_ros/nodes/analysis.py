@@ -14,18 +14,17 @@ from typing import Any
 import numpy as np
 from biped_mfpt_msgs.msg import MeshInfo, MeshStates, MeshTransitions, MfptEstimate
 from biped_mfpt_msgs.srv import ComputeMfpt
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 
 from biped_mfpt_ros.chain.markov import TOLERANCE, ChainError, metastabilities
 from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.nodes.assembly import IncompleteMesh, MeshAssembly
+from biped_mfpt_ros.nodes.fair_service import FairService
 from biped_mfpt_ros.nodes.messages import estimate_message, unpacked
 from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters, parameter
 from biped_mfpt_ros.nodes.publishers import CountedPublisher
-from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
+from biped_mfpt_ros.nodes.qos import RESULTS
 from biped_mfpt_ros.nodes.spin import run_node
 from biped_mfpt_ros.nodes.warm_up import compiled
 from biped_mfpt_ros.walker.robot import STATE_SIZE
@@ -33,6 +32,7 @@ from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG
 
 _MOST_UNFINISHED = 64  # meshes being put together, before the oldest is given up
 _MOST_REASONS = 256  # remembered, why meshes cannot be used
+_MOST_WAITING = 64  # requests
 _MOST_SIGMAS = 10_000  # in one request
 _PROGRESS_EVERY = 5.0  # s
 _SIGMAS_AT_ONCE = 64
@@ -104,14 +104,7 @@ class Analysis(Node):
             RESULTS,
         )
         self.create_timer(1.0, self._give_up_overdue)
-        # Messages are to be taken, and requests answered, while another request is computed.
-        self.create_service(
-            ComputeMfpt,
-            "compute_mfpt",
-            self._compute,
-            qos_profile=REQUESTS,
-            callback_group=ReentrantCallbackGroup(),
-        )
+        FairService(self, ComputeMfpt, "compute_mfpt", _MOST_WAITING, self._thread, self._compute)
         self.get_logger().info("ready")
 
     def close(self) -> None:
@@ -247,23 +240,10 @@ class Analysis(Node):
                 assembly = self._unfinished[mesh_id]
                 self._give_up(assembly, f"{assembly.missing}; messages were lost")
 
-    async def _compute(
+    def _compute(
         self, request: ComputeMfpt.Request, response: ComputeMfpt.Response
     ) -> ComputeMfpt.Response:
-        done: Future[None] = Future()
-
-        def compute() -> None:
-            self._fill(request, response)
-            done.set_result(None)
-            if self.executor is not None:
-                self.executor.wake()
-
-        self._thread.submit(compute)
-        await done
-        return response
-
-    def _fill(self, request: ComputeMfpt.Request, response: ComputeMfpt.Response) -> None:
-        """Answer a request; in the thread of chains. It is never left without an answer."""
+        """Answer a request; in the thread of chains."""
         estimates: list[MfptEstimate] = []
         try:
             mesh_id, known = self._find(request.mesh_id)
@@ -283,6 +263,7 @@ class Analysis(Node):
         except Exception as error:
             self.get_logger().error(f"compute_mfpt failed\n{traceback.format_exc()}")
             response.message = f"internal error of the analysis: {error!r}"
+        return response
 
     def _find(self, mesh_id: str) -> tuple[str, _Known]:
         if not mesh_id and self._known:

@@ -90,7 +90,7 @@ class Tally:
     chunks : int
         Requests sent.
     chunks_repeated : int
-        Chunks handed on because their simulator was gone, late or dropped.
+        Chunks handed on because their simulator was gone, late, dropped or busy.
     step_map_seconds : float
         s, time in the step map, summed over the simulators.
     """
@@ -325,6 +325,9 @@ class FanOut:
         chunk = asked.chunk
         job = chunk.job
         simulator.heard = time.monotonic()
+        if response.busy:
+            self._put_off(simulator, chunk, response.message)
+            return
         wanted = job.request.step_map
         if response.step_map != wanted:
             self._drop(simulator, f"runs step map {response.step_map}, not {wanted}", chunk)
@@ -349,7 +352,7 @@ class FanOut:
             simulator.late = False
             # A simulator answers in order, so the requests before this one got lost on the way.
             for lost in [earlier for earlier in simulator.asked if earlier < ticket]:
-                del simulator.asked[lost]
+                self._repeat_unless_asked(simulator.asked.pop(lost).chunk)
             self._log(f"{name} answers again")
         if chunk.done or job.error is not None:
             return  # it was late, and another one was faster
@@ -416,6 +419,19 @@ class FanOut:
         """Have the chunks that a simulator has not answered done by others."""
         for asked in simulator.asked.values():
             self._repeat(asked.chunk)
+
+    def _put_off(self, simulator: _Simulator, chunk: _Chunk, reason: str) -> None:
+        """Have a chunk done that a simulator had no room for; it is tried again like a late one."""
+        if not simulator.late:
+            self._log(f"{simulator.name} refuses: {reason}")
+            simulator.late = True
+            simulator.try_at = simulator.heard + self._limit(simulator)
+        self._repeat_unless_asked(chunk)
+
+    def _repeat_unless_asked(self, chunk: _Chunk) -> None:
+        """Have a chunk done, unless it was handed on before and someone is at it."""
+        if not any(a.chunk is chunk for s in self._simulators.values() for a in s.asked.values()):
+            self._repeat(chunk)
 
     def _repeat(self, chunk: _Chunk) -> None:
         job = chunk.job

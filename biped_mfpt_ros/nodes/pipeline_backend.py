@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from biped_mfpt_ros.gait.cycle import LimitCycle
+from biped_mfpt_ros.nodes.fair_service import client_name
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 from biped_mfpt_ros.optimise.scoring import BackendLost, MeshFailed
@@ -50,6 +51,7 @@ class PipelineBackend:
     def __init__(self, node: Node, patience: Callable[[], float]) -> None:
         self._node = node
         self._patience = patience
+        self._name = client_name(node)
         self._grow = ActionClient(node, GrowMesh, "grow_mesh")
         # What a node publishes tells it from another one of the same name: the one that died from
         # the one that took its place, which knows nothing of what was asked.
@@ -181,7 +183,10 @@ class PipelineBackend:
                 if (estimate.mu_s, estimate.sigma_s) == (mu_s, sigma_s):
                     return float(estimate.mfpt)
         request = ComputeMfpt.Request(
-            mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array([sigma_s]), "d")
+            mesh_id=mesh_id,
+            mu_s=mu_s,
+            sigma_s=packed(np.array([sigma_s]), "d"),
+            client=self._name,
         )
         deadline = time.monotonic() + self._patience()
         message = "it is not there"
@@ -195,7 +200,7 @@ class PipelineBackend:
                     return float(response.estimates[0].mfpt)
                 if response is not None:
                     message = response.message
-                    if not message.startswith("mesh_id"):
+                    if not (response.busy or message.startswith("mesh_id")):
                         raise MeshFailed(message)
             time.sleep(_ASK_AGAIN)
         raise BackendLost(f"no MFPT of mesh {mesh_id} from the analysis: {message}")

@@ -6,6 +6,7 @@ import os
 import re
 import socket
 import traceback
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +17,14 @@ from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.step import simulate_steps
 from biped_mfpt_ros.jit import STEP_MAP
+from biped_mfpt_ros.nodes.fair_service import FairService
 from biped_mfpt_ros.nodes.messages import fill_response, steps_request_from
 from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters, parameter
-from biped_mfpt_ros.nodes.qos import REQUESTS
 from biped_mfpt_ros.nodes.spin import run_node
 from biped_mfpt_ros.nodes.warm_up import compiled
+
+MOST_WAITING = 64
+"""Requests that wait. A mesher has two at once; a request may have some 0.4 MB, and take 2 s."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +58,8 @@ def warm_up() -> None:
 class Simulator(Node):
     """Serves `SimulateSteps`: a pure function of the request, one request at a time.
 
-    It computes in the service callback on purpose. A simulator has nothing else to do meanwhile,
-    and further requests wait in the middleware, at no cost.
+    Clients are served in turn, so that none has to wait for all that another asks; see
+    `FairService`.
     """
 
     def __init__(self, name: str | None = None) -> None:
@@ -64,10 +68,15 @@ class Simulator(Node):
         # Only then is the service there to be found: who sees a simulator can use it.
         with compiled(self.get_logger().info, "the step map"):
             warm_up()
-        self._service = self.create_service(
-            SimulateSteps, "~/simulate_steps", self._simulate, qos_profile=REQUESTS
+        self._thread = ThreadPoolExecutor(1, "step map")
+        FairService(
+            self, SimulateSteps, "~/simulate_steps", MOST_WAITING, self._thread, self._simulate
         )
         self.get_logger().info(f"ready, with step map {STEP_MAP}")
+
+    def close(self) -> None:
+        """Stop simulating, after the request that is computed."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _simulate(
         self, request: SimulateSteps.Request, response: SimulateSteps.Response

@@ -15,6 +15,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
+from biped_mfpt_ros.nodes.fair_service import client_name
 from biped_mfpt_ros.nodes.qos import REQUESTS
 
 SERVICE_TYPE = "biped_mfpt_msgs/srv/SimulateSteps"
@@ -55,6 +56,7 @@ class GraphSimulators:
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._name = client_name(node)
         self._group = Aside()
         self._woken = GuardCondition(None, None, context=node.context)
         self._clients: dict[str, Client[Any, Any]] = {}
@@ -81,6 +83,7 @@ class GraphSimulators:
     def ask(self, name: str, request: SimulateSteps.Request) -> int:
         """Send a request; see `fan_out.Simulators`."""
         client = self._clients[name]
+        request.client = self._name
         with client.handle:
             return int(client.handle.send_request(request))
 
