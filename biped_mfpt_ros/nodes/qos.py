@@ -39,6 +39,6 @@ REQUESTS = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST,
     depth=256,
 )
-"""`simulate_steps`, `compute_mfpt`: callers keep several requests in flight, and a simulator takes
-none while it computes. The default depth of 10 would silently drop the oldest of several callers'.
+"""`simulate_steps`, `compute_mfpt`: for all callers together, who keep several requests in flight.
+The default depth of 10 would silently drop the oldest ones. See `fair_service`.
 """
