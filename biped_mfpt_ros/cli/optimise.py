@@ -16,6 +16,7 @@ from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.study import summary_text, trial_row
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.optimise.fit import as_spline
 from biped_mfpt_ros.optimise.local import LocalBackend
 from biped_mfpt_ros.optimise.settings import DEFAULT_STAGES, Stage, StudySettings
 from biped_mfpt_ros.optimise.store import Store, Trial
@@ -106,8 +107,11 @@ def _settings(args: argparse.Namespace) -> StudySettings:
     if args.check_walks < 0:
         raise InputError("--check-walks", args.check_walks, "a whole number >= 0")
     given: dict[str, Any] = {} if args.check_walks else {"check_sigmas": ()}
+    start, model = options.controller_of(args), options.model_of(args)
+    if args.as_spline:
+        start = as_spline(start, model.robot)
     return StudySettings(
-        start=options.controller_of(args),
+        start=start,
         searcher=args.searcher,
         seed=args.seed,
         step=args.step,
@@ -115,7 +119,7 @@ def _settings(args: argparse.Namespace) -> StudySettings:
         fixed=tuple(args.fix),
         objectives=dict(args.objective),
         limits=dict(args.limit),
-        model=options.model_of(args),
+        model=model,
         mu_s=options.mean_of(args),
         sigma_s=options.spread("--sigma", args.sigma),
         slope_limit_deg=args.slope_limit,

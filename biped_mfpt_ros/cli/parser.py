@@ -249,6 +249,7 @@ examples:
   biped-mfpt optimise --controller hzd/mfpt --sigma 1 --trials 1000
   biped-mfpt optimise --controller smc/base --sigma 2 --searcher pattern --fix 'k*' \\
       --seconds 3600 --slip-duration 0.008 --torque-limit 45 --mesh 1:1 1:0.3:-0.02
+  biped-mfpt optimise --controller hzd/robust --as-spline --sigma 5 --slope-limit 45
   biped-mfpt optimise --controller hzd/base --objective mfpt cot=20 --searcher nsga2 \\
       --limit speed_min=0.6 clearance_min=0.02 --trials 2000 --study front
 """,
@@ -284,6 +285,11 @@ examples:
         metavar="NAME=X",
         help="constraints on flat ground: speed_min, speed_max (m/s), clearance_min, "
         "step_length_min, step_length_max (m), torque_max (N m)",
+    )
+    optimise.add_argument(
+        "--as-spline",
+        action="store_true",
+        help="start at B-spline references fitted to those of the controller, which must be hzd",
     )
     optimise.add_argument(
         "--fix",
