@@ -182,6 +182,9 @@ class Client(Node):
         One that was killed before is on the graph for some time, so that being ready means little.
         """
         wait_for(lambda: node in self.get_node_names(), node, STARTING)
+        # Its services follow some tenths of a second later. An answer to who asks before that gets
+        # lost, and the goal that is sent again finds the journal in use by the first one.
+        time.sleep(1.0)
         goal = GrowMesh.Goal(settings=settings_message(settings))
         for _ in range(10):
             with suppress(AssertionError):

@@ -29,9 +29,10 @@ def test_zero_is_the_start(name):
     start = controller(name)
     space = SearchSpace(start, rabbit())
     found = space.controller(np.zeros(len(space)))
-    # The paper's alpha_0 and alpha_1 are rounded to four digits; here they are computed.
-    tolerance = 1.1e-4 if name.startswith("hzd") else 1e-15
-    np.testing.assert_allclose(found.parameters, start.parameters, rtol=0, atol=tolerance * 50)
+    # The paper's alpha_0 and alpha_1 are rounded to four digits; here they are computed. The rest
+    # is off by the rounding of a logarithm, of up to 6, and back.
+    tolerance = 5.5e-3 if name.startswith("hzd") else 0.0
+    np.testing.assert_allclose(found.parameters, start.parameters, rtol=3e-15, atol=tolerance)
     assert len(space) == {"hzd": 22, "smc": 18, "spline": 42}[start.scheme]
     assert (space.bounds[:, 0] <= 0.0).all()
     assert (space.bounds[:, 1] >= 0.0).all()

@@ -65,6 +65,8 @@ def test_workers_end_with_their_parent(how):
     pids = [int(pid) for pid in parent.stdout.readline().split()]
     assert pids
     assert all(map(alive, pids))
+    # Until it waits for the job: where Python runs a callback, it drops a KeyboardInterrupt.
+    time.sleep(0.5)
     start = time.monotonic()
     parent.send_signal(how)
     parent.wait(20.0)
