@@ -15,7 +15,8 @@ from biped_mfpt_ros.cli.workers import workers
 
 # A worker that takes longer than any test, in a process that says who its workers are.
 PARENT = """
-import os, sys, time
+import os, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # it may have been ignored, and inherited
 from biped_mfpt_ros.cli.workers import workers
 with workers(2) as pool:
     print(*{f.result() for f in [pool.submit(os.getpid)] * 2}, flush=True)
