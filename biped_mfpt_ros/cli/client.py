@@ -31,7 +31,7 @@ _POLL = 0.05  # s
 _RESEND = 5.0  # s without an answer, after which a goal is sent again
 # What a recorder has to hear of a run: it finds each of them by itself, some tenths of a second
 # after its publisher, and a small mesh is grown and solved in less.
-_RESULTS = ("mesh/info", "mesh/states", "mesh/transitions", "mfpt")
+RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
 
 
 @dataclass(frozen=True)
@@ -124,14 +124,12 @@ class Client:
             simulators=len(simulators),
             mesher=self._grow.server_is_ready(),
             analysis=self._compute.service_is_ready(),
-            recorder=all(map(self._is_recorded, _RESULTS)),
+            recorder=any(
+                self.listens(name, RECORDED)
+                for name in self._node.get_node_names()
+                if name.startswith("recorder")
+            ),
         )
-
-    def _is_recorded(self, topic: str) -> bool:
-        subscriptions = self._node.get_subscriptions_info_by_topic(
-            self._node.resolve_topic_name(topic)
-        )
-        return any(info.node_name.startswith("recorder") for info in subscriptions)
 
     def sees(self, node: str) -> bool:
         """Whether a node is there."""

@@ -16,7 +16,6 @@ from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.study import summary_text, trial_row
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.optimise.fit import as_spline
 from biped_mfpt_ros.optimise.local import LocalBackend
 from biped_mfpt_ros.optimise.settings import DEFAULT_STAGES, Stage, StudySettings
 from biped_mfpt_ros.optimise.store import Store, Trial
@@ -109,6 +108,8 @@ def _settings(args: argparse.Namespace) -> StudySettings:
     given: dict[str, Any] = {} if args.check_walks else {"check_sigmas": ()}
     start, model = options.controller_of(args), options.model_of(args)
     if args.as_spline:
+        from biped_mfpt_ros.optimise.fit import as_spline
+
         start = as_spline(start, model.robot)
     return StudySettings(
         start=start,

@@ -46,7 +46,6 @@ _POLL = 0.2  # s
 _PATIENCE = 10.0  # s
 _MOST_TRIES = 3  # for a mesh to be in its bag
 _PRIOR = 60.0  # s of work after which the pace is believed rather than the plan
-_RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
 
 
 def reproduce(args: argparse.Namespace) -> None:
@@ -244,7 +243,7 @@ class _Grown:
 
 def _meshes(study: _Study, jobs: Sequence[Job], pipeline: Pipeline, directory: Path) -> None:
     """Grow meshes with the pipeline's nodes, and record each in a bag of its own."""
-    from biped_mfpt_ros.cli.client import Client
+    from biped_mfpt_ros.cli.client import RECORDED, Client
     from biped_mfpt_ros.nodes.recorder import Recorder
 
     start = time.monotonic()
@@ -278,7 +277,7 @@ def _meshes(study: _Study, jobs: Sequence[Job], pipeline: Pipeline, directory: P
             began = time.monotonic()
             study.show(job, "starting its recorder")
             client.wait(
-                partial(client.listens, name, _RECORDED), START_TIMEOUT, f"{name} to come up"
+                partial(client.listens, name, RECORDED), START_TIMEOUT, f"{name} to come up"
             )
             result = _grow(study, job, client)
             _wait_for_estimates(study, job, client, result["mesh_id"], recorder)

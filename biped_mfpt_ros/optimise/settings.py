@@ -100,8 +100,8 @@ class StudySettings:
         Multiples of sigma_s: at the least of them at which the confirming mesh gives no more than
         ``check_steps`` steps, Monte Carlo has to agree. Empty: no such check.
     check_steps : float
-        See there. As many as walks can afford: a mesh claimed 85 steps where walks took 12, and
-        at twice the sigma, where it claimed 20, they agreed.
+        See there. As many as walks can afford, since walks at a larger sigma do not tell all: a
+        mesh claimed 85 steps where walks at that sigma took 12.
     check_walks : int
         Walks of that check.
     trial_seconds : float
