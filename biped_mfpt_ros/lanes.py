@@ -1,9 +1,11 @@
 """Several swings at once: numbers of `LANES` lanes, as one vector register holds them.
 
 A kernel written for numbers also takes `Lanes`: they add, subtract, multiply, divide, compare and
-`select` lane by lane, each exactly as the number alone would, so that a lane's result depends
-neither on the others nor on the instructions that a machine has. What cannot be written so (a
-branch, a table) is done lane by lane on memory.
+`select` lane by lane, so that a lane's result depends neither on the others nor on the instructions
+that a machine has. A product that is added or subtracted in the same expression is not rounded
+before: one instruction does both. Which products, this module decides from the source, and not the
+compiler from the machine; a processor without that instruction gets the same bits, slowly. What
+cannot be written so (a branch, a table) is done lane by lane on memory.
 
 Numba has no such type; this module adds it by numba's extension interface.
 """
@@ -88,12 +90,37 @@ def _define(operation: Any, result: types.Type, kind: type, emit: Callable) -> N
             lower_builtin(operation, other, kind)(lower)
 
 
-for _operation, _method in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
+def _fused(builder: Any, product: Any, negated: bool, rest: Any) -> Any:
+    """``rest`` with a product added or, ``negated``, subtracted, rounded once."""
+    x, y = product.operands
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{LANES}f64")
+    return builder.call(function, [builder.fneg(x) if negated else x, y, rest])
+
+
+def _is_product(value: Any) -> bool:
+    return isinstance(value, ir.Instruction) and value.opname == "fmul"
+
+
+def _add(builder: Any, x: Any, y: Any) -> Any:
+    if _is_product(y):
+        return _fused(builder, y, False, x)
+    if _is_product(x):
+        return _fused(builder, x, False, y)
+    return builder.fadd(x, y)
+
+
+def _subtract(builder: Any, x: Any, y: Any) -> Any:
+    if _is_product(y):
+        return _fused(builder, y, True, x)
+    if _is_product(x):
+        return _fused(builder, x, False, builder.fneg(y))
+    return builder.fsub(x, y)
+
+
+_define(operator.add, _lanes, _LanesType, _add)
+_define(operator.sub, _lanes, _LanesType, _subtract)
+for _operation, _method in ((operator.mul, "fmul"), (operator.truediv, "fdiv")):
     _define(_operation, _lanes, _LanesType, lambda b, x, y, m=_method: getattr(b, m)(x, y))
 for _operation, _sign in (
     (operator.lt, "<"),
@@ -263,6 +290,30 @@ def power_of_two(context, x):  # type: ignore[no-untyped-def]
         return builder.bitcast(builder.shl(bits, constant(52)), args[0].type)
 
     return x(x), generate
+
+
+@intrinsic
+def _negated_if_odd(context, x, number):  # type: ignore[no-untyped-def]
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        bits, _, constant = _bits(builder, args[0])
+        last, _, _ = _bits(builder, args[1])
+        sign = builder.shl(last, constant(63))
+        return builder.bitcast(builder.xor(bits, sign), args[0].type)
+
+    return x(x, x), generate
+
+
+def negated_if_odd(x: Any, number: Any) -> Any:
+    """``x``, negated where ``number`` is odd, a whole one from 2^52 to 2^53: its last bit says so.
+
+    Both are numbers, or both are lanes.
+    """
+    return -x if number % 2.0 == 1.0 else x
+
+
+@overload(negated_if_odd)
+def _overload_negated_if_odd(x, number):  # type: ignore[no-untyped-def]
+    return lambda x, number: _negated_if_odd(x, number)
 
 
 @intrinsic

@@ -51,6 +51,9 @@ class Counting:
     def __truediv__(self, other: Any) -> Counting:
         return self._with(self.value / Counting(other).value)
 
+    def __mod__(self, other: float) -> float:
+        return self.value % other
+
     def __neg__(self) -> Counting:
         return Counting(-self.value)
 
@@ -87,9 +90,10 @@ def _count() -> dict[str, float]:
     s, c = counted("sines and cosines", dynamics.sines, a)
     alpha, beta = counted("controller", hzd.command, par, a, da)
     dda = counted("accelerations", dynamics.prescribed_motion, rob, s, c, da, alpha, beta)
-    u = counted("torques", dynamics.required_torques, rob, s, c, da, dda)
+    x, y = counted("torques", dynamics.link_accelerations, s, c, da, dda)
+    u = counted("torques", dynamics.required_torques, rob, s, c, dda, x, y)
     counted("torques", powers, u, da)
-    counted("forces", dynamics.ground_force, rob, s, c, da, dda)
+    counted("forces", dynamics.ground_force, rob, x, y)
     # The integrator's own share: sums over the stages, then the estimate of the error.
     stages = integrate._STAGES[: integrate.STAGES]
     sums = STATES * sum(2 * len(stage) + 1 for stage in stages)

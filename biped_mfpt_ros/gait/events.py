@@ -18,7 +18,19 @@ from biped_mfpt_ros.gait.closed_loop import (
     switch,
 )
 from biped_mfpt_ros.gait.integrate import state_at
-from biped_mfpt_ros.gait.scratch import AT, FEET, MODE, PLACES, SPARE, SWITCHED, VALUE
+from biped_mfpt_ros.gait.scratch import (
+    AT,
+    CUT,
+    FEET,
+    IMPACTS,
+    MODE,
+    PLACES,
+    SPARE,
+    SWITCHED,
+    TRIED,
+    TRIED_VALUE,
+    VALUE,
+)
 from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat, store
 from biped_mfpt_ros.walker import robot as r
@@ -31,6 +43,10 @@ _NEWTON_RESOLUTION = 1e-7
 """s: what a last step of Newton's method may move to leave less than `TIME_RESOLUTION`."""
 CUT_RESOLUTION = 1e-9
 """Of the torque limit: how far a torque may be beyond it before it is cut off."""
+TORQUES, SLIP, LIFT = range(3)
+"""What changes its sign: torques beyond their limits, the margin against slipping, the load."""
+_TRIED = 4  # places at once
+_MOST_ROUNDS = 60
 
 
 @inner_kernel
@@ -208,8 +224,126 @@ def motion_at(scheme, rob, par, w, lane, at):
 
 
 @inner_kernel
-def first_change(scheme, rob, par, w, lane, span):
+def _inverse_cubic(t, f, i):
+    """Where the inverse cubic through four points from the i-th vanishes, by Neville's scheme.
+
+    Also how far the parabolas through the first three and the last three are apart there. Not a
+    number where the values do not ascend.
+    """
+    t0, t1, t2, t3 = t[i], t[i + 1], t[i + 2], t[i + 3]
+    f0, f1, f2, f3 = f[i], f[i + 1], f[i + 2], f[i + 3]
+    if not f0 < f1 < f2 < f3:
+        return math.nan, math.nan
+    t0 = (t0 * f1 - t1 * f0) / (f1 - f0)
+    t1 = (t1 * f2 - t2 * f1) / (f2 - f1)
+    t2 = (t2 * f3 - t3 * f2) / (f3 - f2)
+    t0 = (t0 * f2 - t1 * f0) / (f2 - f0)
+    t1 = (t1 * f3 - t2 * f1) / (f3 - f1)
+    return (t0 * f3 - t1 * f0) / (f3 - f0), abs(t1 - t0)
+
+
+@inner_kernel
+def _narrow(t, f, first):
+    """What six points, from the ``first`` on, with ascending ``t``, tell of where ``f`` vanishes.
+
+    Returns
+    -------
+    tuple
+        The points before and after, (t, f) each; where it vanishes, about, and how far from there
+        that may be; four places to try next.
+    """
+    j = first + 1
+    while j < 5 and not f[j] > 0.0:
+        j += 1
+    low, high = (t[j - 1], f[j - 1]), (t[j], f[j])
+    at, apart = _inverse_cubic(t, f, min(max(j - 2, first), 2))
+    about = 0.1 * apart
+    if not low[0] < at < high[0]:
+        at = next_guess(low[0], low[1], high[0], high[1])
+        about = 0.1 * (high[0] - low[0])
+    left = at - min(max(about, 1e-13), 0.5 * (at - low[0]))
+    right = at + min(max(about, 1e-13), 0.5 * (high[0] - at))
+    # One more place makes sure that no large part is left, whatever the function is like.
+    if at - low[0] > high[0] - at:
+        return low, high, at, about, (0.5 * (low[0] + left), left, at, right)
+    return low, high, at, about, (left, at, right, 0.5 * (right + high[0]))
+
+
+@inner_kernel
+def _crossing(scheme, rob, par, w, lane, what, low, high, places, enough, span):
+    """Where a function of the motion changes its sign between two fractions of the step.
+
+    Four places are tried at once, about where the inverse cubic through those before vanishes: two
+    rounds mostly.
+
+    Parameters
+    ----------
+    scheme, rob, par, w, lane
+        As for `motion_at`.
+    what : int
+        `TORQUES`: how far torques are beyond their limits; `SLIP`: the margin against slipping;
+        `LIFT`: the normal force.
+    low, high : tuple of float
+        Two fractions with the values there, of different sign.
+    places : tuple of float
+        Four fractions between them to begin with, ascending.
+    enough : float
+        Value that passes for zero.
+    span : float
+        s, length of the step.
+
+    Returns
+    -------
+    tuple
+        The fraction; in which lane of row IMPACTS the nearest one tried stands, with the torques
+        wanted there in its first columns; evaluations made.
+    """
+    cut, _, _ = mode_of(w, lane)
+    sign = 1.0 if high[1] > low[1] else -1.0
+    low, high = (low[0], sign * low[1]), (high[0], sign * high[1])
+    at = high[0]
+    nearest = 0
+    evaluations = 0
+    for _ in range(_MOST_ROUNDS):
+        for n in range(LANES):
+            w[IMPACTS, TRIED, n] = places[min(n, _TRIED - 1)]
+        wanted, _, force = motion_at(scheme, rob, par, w, lane, load(w, IMPACTS, TRIED))
+        evaluations += _TRIED
+        for n in range(4):
+            store(w, IMPACTS, n, wanted[n])
+        if what == TORQUES:
+            store(w, IMPACTS, TRIED_VALUE, sign * beyond(rob, cut, wanted))
+        elif what == SLIP:
+            store(w, IMPACTS, TRIED_VALUE, sign * margin(rob, force))
+        else:
+            store(w, IMPACTS, TRIED_VALUE, sign * force[1])
+        nearest = 0
+        for n in range(1, _TRIED):
+            if abs(w[IMPACTS, TRIED_VALUE, n]) < abs(w[IMPACTS, TRIED_VALUE, nearest]):
+                nearest = n
+        at = w[IMPACTS, TRIED, nearest]
+        if abs(w[IMPACTS, TRIED_VALUE, nearest]) <= enough:
+            break
+        values = (
+            low[1],
+            w[IMPACTS, TRIED_VALUE, 0],
+            w[IMPACTS, TRIED_VALUE, 1],
+            w[IMPACTS, TRIED_VALUE, 2],
+            w[IMPACTS, TRIED_VALUE, 3],
+            high[1],
+        )
+        t = (low[0], places[0], places[1], places[2], places[3], high[0])
+        low, high, at, about, places = _narrow(t, values, 0)
+        if about * span < TIME_RESOLUTION:
+            break
+    return at, nearest, evaluations
+
+
+@inner_kernel
+def first_change(scheme, rob, par, w, lane, start, span):
     """When the first torque reaches its limit, or leaves it, and which.
+
+    ``start`` is how far torques are beyond their limits at the start of the step, N m.
 
     Returns
     -------
@@ -219,45 +353,26 @@ def first_change(scheme, rob, par, w, lane, span):
     """
     cut, _, _ = mode_of(w, lane)
     slack = CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
-    for k in range(LANES):
-        w[PLACES, AT, k] = (k + 1) / LANES
+    for n in range(LANES):
+        w[PLACES, AT, n] = min((n + 1) / _TRIED, 1.0)
     wanted, _, _ = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
-    evaluations = LANES
     store(w, PLACES, VALUE, beyond(rob, cut, wanted))
-    low, low_value = 0.0, -slack
-    high, high_value = 0.0, -slack
-    for k in range(LANES):
-        low, low_value = high, high_value
-        high, high_value = w[PLACES, AT, k], w[PLACES, VALUE, k]
-        if not high_value <= slack:
-            break
-    if high_value <= slack:
-        return 2.0, -1, 0.0, evaluations
-    # Illinois: regula falsi, halving the value of an end that stays.
-    low_value = min(low_value, -slack)
-    at = high
-    side = 0
-    for _ in range(60):
-        at = next_guess(low, low_value, high, high_value)
-        wanted, _, _ = motion_at(scheme, rob, par, w, lane, splat(at))
-        evaluations += 1
-        value = lane_of(beyond(rob, cut, wanted), 0)
-        if abs(value) <= 0.1 * slack or (high - low) * span < TIME_RESOLUTION:
-            break
-        if value > 0.0:
-            high, high_value = at, value
-            if side == 1:
-                low_value *= 0.5
-            side = 1
-        else:
-            low, low_value = at, value
-            if side == -1:
-                high_value *= 0.5
-            side = -1
+    f0, f1 = w[PLACES, VALUE, 0], w[PLACES, VALUE, 1]
+    f2, f3 = w[PLACES, VALUE, 2], w[PLACES, VALUE, 3]
+    if f0 <= slack and f1 <= slack and f2 <= slack and f3 <= slack:
+        return 2.0, -1, 0.0, _TRIED
+    # What is at the limit, to rounding, is not beyond it yet.
+    f0, f1, f2 = f0 - slack, f1 - slack, f2 - slack
+    values = (-math.inf, min(start, 0.0) - slack, f0, f1, f2, f3)
+    low, high, _, _, places = _narrow((0.0, 0.0, 0.25, 0.5, 0.75, 1.0), values, 1)
+    low, high = (low[0], min(low[1] + slack, -slack)), (high[0], high[1] + slack)
+    at, nearest, evaluations = _crossing(
+        scheme, rob, par, w, lane, TORQUES, low, high, places, 0.1 * slack, span
+    )
     joint, held = 0, 0.0
     farthest = -math.inf
     for i in range(4):
-        torque, sign = lane_of(wanted[i], 0), lane_of(cut[i], 0)
+        torque, sign = w[IMPACTS, i, nearest], w[MODE, CUT + i, lane]
         one = abs(torque) - rob[r.TORQUE_LIMIT]
         if sign != 0.0:
             one = rob[r.TORQUE_LIMIT] - sign * torque
@@ -266,7 +381,7 @@ def first_change(scheme, rob, par, w, lane, span):
             held = 0.0
             if sign == 0.0:
                 held = 1.0 if torque > 0.0 else -1.0
-    return at, joint, held, evaluations
+    return at, joint, held, _TRIED + evaluations
 
 
 @inner_kernel
@@ -316,32 +431,30 @@ def force_once(scheme, rob, par, w, lane, at):
 
 
 @inner_kernel
-def slip_root(scheme, rob, par, w, lane, lifts, low, low_value, high, high_value, span):
-    """When the stance foot begins (or ends) to slip: where the margin changes its sign.
+def slip_root(scheme, rob, par, w, lane, what, low, low_value, high, high_value, span):
+    """When the stance foot begins or ends to slip, or lifts: a fraction, and evaluations made.
 
-    With ``lifts``, when it lifts: where the normal force does.
+    ``what`` is `SLIP` or `LIFT`.
     """
     if (low_value > 0.0) == (high_value > 0.0):
-        return low  # it had begun (or ended) with a jump, there
-    side = 0
-    at = high
-    for _ in range(60):
-        at = next_guess(low, low_value, high, high_value)
-        force = force_once(scheme, rob, par, w, lane, at)
-        value = force[1] if lifts else margin(rob, force)
-        if abs(value) < 1e-9 * rob[r.MASS] * rob[r.GRAVITY] or (high - low) * span < 1e-10:
-            break
-        if (value > 0.0) == (high_value > 0.0):
-            high, high_value = at, value
-            if side == 1:
-                low_value *= 0.5
-            side = 1
-        else:
-            low, low_value = at, value
-            if side == -1:
-                high_value *= 0.5
-            side = -1
-    return at
+        return low, 0  # it had begun (or ended) with a jump, there
+    enough = 1e-9 * rob[r.MASS] * rob[r.GRAVITY]
+    part = (high - low) / (_TRIED + 1)
+    places = (low + part, low + 2.0 * part, low + 3.0 * part, low + 4.0 * part)
+    at, _, evaluations = _crossing(
+        scheme,
+        rob,
+        par,
+        w,
+        lane,
+        what,
+        (low, low_value),
+        (high, high_value),
+        places,
+        enough,
+        span,
+    )
+    return at, evaluations
 
 
 @inner_kernel

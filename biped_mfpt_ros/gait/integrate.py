@@ -43,6 +43,7 @@ from biped_mfpt_ros.gait.scratch import (
     STAGE,
     STATES,
     TANGENTIAL,
+    TURNS,
     WORK,
     Y_NEW,
     H,
@@ -57,6 +58,8 @@ STAGES = 12
 DENSE_STAGES = 3
 """Further evaluations for the dense output."""
 ORDER = 8
+POWER_STAGES = (5, 9, 10, STAGES)
+"""Stages, after the first, at whose powers a step is searched for changes of their signs."""
 
 # Written out, and compared with scipy's in the tests: importing scipy.integrate for them would cost
 # every process half a second. Stage by stage: of which earlier stages it takes how much.
@@ -338,6 +341,14 @@ def trial_step(scheme, rob, par, w):
     store(w, ESTIMATE, MOST, most)
     store(w, ESTIMATE, LEAST_NORMAL, normal)
     store(w, ESTIMATE, BEYOND, over)
+    for i in range(WORK, SIZE):
+        power = load(w, STAGE, i)
+        low, high = power, power
+        for stage in POWER_STAGES:
+            power = load(w, STAGE + stage, i)
+            low = select(power < low, power, low)
+            high = select(power > high, power, high)
+        store(w, ESTIMATE, TURNS + i - WORK, low * high)
     order_5 = h * 0.0
     order_3 = h * 0.0
     for i in range(STATES):

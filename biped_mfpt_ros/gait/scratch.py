@@ -31,7 +31,7 @@ WORK = 10
 ) = range(10)
 LOBE = 10
 """Row of the first of four joints: up to four fractions of the step where the joint's power changes
-its sign, 2 for none, then its work up to each of them (J)."""
+its sign, 2 after the last, then its work up to each of them (J)."""
 STAGE = LOBE + 4
 """Row of the derivative at the start of a step; those of the integrator's stages follow."""
 DENSE = STAGE + 16
@@ -45,8 +45,10 @@ CUT, SWITCHED, H, SLIDES = 0, 4, 5, 6
 SINES, COSINES = 0, 5
 # Columns of ESTIMATE: error of order 5 and of order 3, least and greatest margin against slipping
 # and least normal force over the stages (N), how far a torque is beyond its limit, at most (N m),
-# and at the end of the step: force (N), and the latter again.
+# and at the end of the step: force (N), and the latter again; of four joints, the product of the
+# least and the greatest power over some stages (W^2): below zero where it changes its sign.
 ERROR_5, ERROR_3, LEAST, MOST, LEAST_NORMAL, BEYOND, TANGENTIAL, NORMAL, CLEARANCE = range(9)
+TURNS = 9
 
 
 @kernel
@@ -57,6 +59,9 @@ def empty_scratch():
 
 # Columns of PLACES: fraction, between which fractions, normal of the slope, how it turned out.
 AT, LOW, HIGH, NORMAL_X, NORMAL_Y, FOUND, VALUE, LOAD, ENERGY_AT, LENGTH, TOUCHES = range(11)
+
+# Columns of IMPACTS while a crossing is sought, after torques wanted (4): fractions, values there.
+TRIED, TRIED_VALUE = 4, 5
 
 # Rows of a swing's variables, of shape (VARIABLES, LANES).
 (
@@ -87,7 +92,8 @@ AT, LOW, HIGH, NORMAL_X, NORMAL_Y, FOUND, VALUE, LOAD, ENERGY_AT, LENGTH, TOUCHE
     END_DX,
     END_DY,
     SLIDE,  # 1 if an output begins to slide in it
+    START_BEYOND,  # N m, how far torques are beyond their limits at the start of the step, at most
     LAST_H,  # length and error of the step before, 0 if the motion was not smooth since then
     LAST_ERROR,
-) = range(29)
-VARIABLES = 29
+) = range(30)
+VARIABLES = 30

@@ -25,6 +25,8 @@ from biped_mfpt_ros.gait.closed_loop import (
 )
 from biped_mfpt_ros.gait.events import (
     CUT_RESOLUTION,
+    LIFT,
+    SLIP,
     body_root,
     body_touches,
     body_touches_at,
@@ -104,6 +106,7 @@ from biped_mfpt_ros.gait.scratch import (
     SLIDES,
     SLIPS,
     STAGE,
+    START_BEYOND,
     STATES,
     STEPS,
     SWITCHED,
@@ -112,6 +115,7 @@ from biped_mfpt_ros.gait.scratch import (
     TIME,
     TODO,
     TOUCHES,
+    TURNS,
     VALUE,
     WORK,
     Y_NEW,
@@ -286,6 +290,7 @@ def _restart(scheme, rob, par, w, v, lane, afresh):
     for i in range(4):
         w[STAGE, WORK + i, lane] = lane_of(power[i], lane)
     v[MARGIN, lane] = lane_of(margin(rob, force), lane)
+    v[START_BEYOND, lane] = lane_of(beyond(rob, mode[0], wanted), lane)
     return s, c, lane_of(force[1], lane)
 
 
@@ -462,7 +467,9 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
     # The step ends early where a torque reaches or leaves its limit, or the controller switches.
     end, joint, held, switches = 1.0, -1, 0.0, False
     if v[CHANGES, lane] != 0.0:
-        at, joint, held, evaluations = first_change(scheme, rob, par, w, lane, h)
+        at, joint, held, evaluations = first_change(
+            scheme, rob, par, w, lane, v[START_BEYOND, lane], h
+        )
         v[EVALUATIONS, lane] += evaluations
         if joint >= 0:
             end = min(1.0, max(at, _SHORTEST_STEP / h))
@@ -523,6 +530,7 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
     else:
         for i in range(SIZE):
             w[STAGE, i, lane] = w[STAGE + STAGES, i, lane]
+        v[START_BEYOND, lane] = w[ESTIMATE, CLEARANCE, lane]
         v[MARGIN, lane] = margin(rob, (w[ESTIMATE, TANGENTIAL, lane], w[ESTIMATE, NORMAL, lane]))
 
 
@@ -581,7 +589,10 @@ def _first_fall(scheme, rob, par, w, v, lane, end, h):
         slips = not value > 0.0
         began, until = since, t + at * h
         if slips != slipping:
-            root = slip_root(scheme, rob, par, w, lane, False, last, last_value, at, value, h)
+            root, evaluations = slip_root(
+                scheme, rob, par, w, lane, SLIP, last, last_value, at, value, h
+            )
+            v[EVALUATIONS, lane] += evaluations
             if slips:
                 since = t + root * h
                 began = since
@@ -596,7 +607,10 @@ def _first_fall(scheme, rob, par, w, v, lane, end, h):
         if not normal > 0.0:
             v[SINCE, lane] = since
             _, before = force_once(scheme, rob, par, w, lane, last)
-            at = slip_root(scheme, rob, par, w, lane, True, last, before, at, normal, h)
+            at, evaluations = slip_root(
+                scheme, rob, par, w, lane, LIFT, last, before, at, normal, h
+            )
+            v[EVALUATIONS, lane] += evaluations
             return at, _LIFTS
         slipping, last, last_value = slips, at, value
     v[SINCE, lane] = since
@@ -777,12 +791,12 @@ def _find_lobes(w, lane):
     h = w[MODE, H, lane]
     for i in range(4):
         row = LOBE + i
-        for k in range(4):
-            w[row, k, lane] = 2.0
-        column = WORK + i
-        p0, p1, p2 = w[STAGE, column, lane], w[STAGE + 5, column, lane], w[STAGE + 9, column, lane]
-        p3, p4 = w[STAGE + 10, column, lane], w[STAGE + STAGES, column, lane]
-        if min(min(p0, p1), min(p2, min(p3, p4))) * max(max(p0, p1), max(p2, max(p3, p4))) < 0.0:
+        w[row, 0, lane] = 2.0
+        if w[ESTIMATE, TURNS + i, lane] < 0.0:
+            column = WORK + i
+            p0, p1 = w[STAGE, column, lane], w[STAGE + 5, column, lane]
+            p2, p3 = w[STAGE + 9, column, lane], w[STAGE + 10, column, lane]
+            p4 = w[STAGE + STAGES, column, lane]
             # Newton's divided differences on the nodes, then powers of the fraction.
             d1 = (p1 - p0) / _N1
             e2 = (p2 - p1) / (_N2 - _N1)
@@ -816,6 +830,8 @@ def _find_lobes(w, lane):
                     w[row, found, lane] = at
                     w[row, 4 + found, lane] = h * at * work
                     found += 1
+            if found < 4:
+                w[row, found, lane] = 2.0
 
 
 @inner_kernel

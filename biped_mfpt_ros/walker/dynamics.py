@@ -24,40 +24,39 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.jit import inner_kernel
-from biped_mfpt_ros.lanes import select
+from biped_mfpt_ros.lanes import negated_if_odd
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.robot import ABSOLUTE, C, Robot, W, WalkerModel
 
-# Cephes' polynomials on [-pi/4, pi/4] and pi/2 in three parts (Cody and Waite).
-_TWO_OVER_PI = 2.0 / math.pi
-_PIO2_1, _PIO2_2 = 1.57079625129699707031e0, 7.54978941586159635335e-8
-_PIO2_3 = 5.390302529957765e-15
-_S0, _S1, _S2 = 1.58962301576546568060e-10, -2.50507477628578072866e-8, 2.75573136213857245213e-6
-_S3, _S4, _S5 = -1.98412698295895385996e-4, 8.33333333332211858878e-3, -1.66666666666666307295e-1
-_C0, _C1, _C2 = -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7
-_C3, _C4, _C5 = 2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2
+# pi in two parts, the first of 33 bits: a multiple of it up to 2^20 is exact.
+_ONE_OVER_PI = 1.0 / math.pi
+_PI_1, _PI_2 = 3.14159265346825122833, 1.21542010130123852030e-10
+# Minimax polynomials of z = x^2 on |x| <= pi/2, sin x = x + x z P(z) and cos x = 1 + z Q(z), good
+# to 1.1e-16 and 2.1e-15 (Remez's algorithm in 60 digits). Reducing by pi/2 would take shorter ones,
+# but selections between the two.
+_S0, _S1, _S2 = -0.166666666666658124517, 8.33333333326290254085e-3, -1.98412698200999517168e-4
+_S3, _S4, _S5 = 2.75573160776629966540e-6, -2.50518515347172535256e-8, 1.60473022579651046159e-10
+_S6 = -7.36465807087021042561e-13
+_C0, _C1, _C2 = -0.499999999999931192942, 4.16666666659542008159e-2, -1.38888888639337315290e-3
+_C3, _C4, _C5 = 2.48015831562832136637e-5, -2.75569507514182938429e-7, 2.08587350659186485214e-9
+_C6 = -1.10124905199128749597e-11
 _ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to an integer
 
 
 @inner_kernel
 def sine_cosine(angle):
-    """Sine and cosine at once, to within 2 units in the last place for angles up to 1e5 rad.
+    """Sine and cosine at once, to within 3e-15 for angles up to 1e5 rad.
 
     The C library's differ in their last bit from machine to machine, with the instructions that it
     chooses; these do not, so that every machine simulates the same step to the last bit.
     """
-    quadrant = (angle * _TWO_OVER_PI + _ROUND) - _ROUND
-    x = ((angle - quadrant * _PIO2_1) - quadrant * _PIO2_2) - quadrant * _PIO2_3
+    rounded = angle * _ONE_OVER_PI + _ROUND
+    half_turns = rounded - _ROUND
+    x = (angle - half_turns * _PI_1) - half_turns * _PI_2
     z = x * x
-    sine = x + x * z * (((((_S0 * z + _S1) * z + _S2) * z + _S3) * z + _S4) * z + _S5)
-    cosine = 1.0 - 0.5 * z + z * z * (((((_C0 * z + _C1) * z + _C2) * z + _C3) * z + _C4) * z + _C5)
-    turn = quadrant - 4.0 * ((0.25 * quadrant + _ROUND) - _ROUND)  # -2 to 2
-    odd = abs(turn) == 1.0
-    s = select(odd, cosine, sine)
-    c = select(odd, sine, cosine)
-    s = select((turn < 0.0) | (turn > 1.0), -s, s)
-    c = select((turn > 0.0) | (turn < -1.0), -c, c)
-    return s, c
+    sine = (((((_S6 * z + _S5) * z + _S4) * z + _S3) * z + _S2) * z + _S1) * z + _S0
+    cosine = (((((_C6 * z + _C5) * z + _C4) * z + _C3) * z + _C2) * z + _C1) * z + _C0
+    return negated_if_odd(x + x * z * sine, rounded), negated_if_odd(1.0 + z * cosine, rounded)
 
 
 @inner_kernel
@@ -99,8 +98,8 @@ def weighted(rob, x):
 
 
 @inner_kernel
-def _foot_acceleration(s, c, da, dda):
-    """Second derivatives of the five ``-e(a_i)``: tuples of x and of y."""
+def link_accelerations(s, c, da, dda):
+    """Second derivatives of the five ``-e(a_i)``, 1/s^2: tuples of x and of y."""
     q0, q1, q2 = da[0] * da[0], da[1] * da[1], da[2] * da[2]
     q3, q4 = da[3] * da[3], da[4] * da[4]
     x = (
@@ -121,16 +120,17 @@ def _foot_acceleration(s, c, da, dda):
 
 
 @inner_kernel
-def ground_force(rob, s, c, da, dda):
-    """Force of the ground on the stance foot in the vertical frame: tangential, normal, N."""
-    x, y = _foot_acceleration(s, c, da, dda)
+def ground_force(rob, x, y):
+    """Force of the ground on the stance foot in the vertical frame: tangential, normal, N.
+
+    ``x`` and ``y`` are `link_accelerations`.
+    """
     return -weighted(rob, x), rob[r.MASS] * rob[r.GRAVITY] - weighted(rob, y)
 
 
 @inner_kernel
-def required_torques(rob, s, c, da, dda):
-    """Torques u1 to u4 for given accelerations, N m."""
-    x, y = _foot_acceleration(s, c, da, dda)
+def required_torques(rob, s, c, dda, x, y):
+    """Torques u1 to u4 for given accelerations, N m; ``x``, ``y`` are `link_accelerations`."""
     u = coupling(rob, x)
     v = coupling(rob, y)
     g = rob[r.GRAVITY]
@@ -249,6 +249,12 @@ def free_motion(rob, s, c, da, u):
         -u[0] - u[1] + s[4] * (g * rob[W + 4] - p[4]) + c[4] * q[4],
     )
     return solve(rob, s, c, right)
+
+
+@inner_kernel
+def change_of_motion(rob, s, c, u):
+    """By how much accelerations change with a change of the torques u1 to u4, rad/s^2."""
+    return solve(rob, s, c, (u[0] - u[2], u[1] - u[3], u[2], u[3], -u[0] - u[1]))
 
 
 @inner_kernel
