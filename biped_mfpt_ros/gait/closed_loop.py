@@ -182,7 +182,8 @@ def motion(scheme, rob, par, w, row, mode):
     wanted = dynamics.required_torques(rob, s, c, dda, x, y)
     applied = wanted
     off = _off(scheme, switched)
-    if any_lane(_is_cut(cut, off)):
+    is_cut = _is_cut(cut, off)
+    if any_lane(is_cut):
         applied = _applied(rob, cut, off, wanted)
         cut_away = (
             applied[0] - wanted[0],
@@ -190,14 +191,14 @@ def motion(scheme, rob, par, w, row, mode):
             applied[2] - wanted[2],
             applied[3] - wanted[3],
         )
-        # Linear in the torques; a lane where none is cut off changes by zero.
+        # Linear in the torques.
         change = dynamics.change_of_motion(rob, s, c, cut_away)
         dda = (
-            dda[0] + change[0],
-            dda[1] + change[1],
-            dda[2] + change[2],
-            dda[3] + change[3],
-            dda[4] + change[4],
+            select(is_cut, dda[0] + change[0], dda[0]),
+            select(is_cut, dda[1] + change[1], dda[1]),
+            select(is_cut, dda[2] + change[2], dda[2]),
+            select(is_cut, dda[3] + change[3], dda[3]),
+            select(is_cut, dda[4] + change[4], dda[4]),
         )
         # Where the controller asks for nearly infinite torques, too few digits are left of that.
         most = abs(cut_away[0]) + abs(cut_away[1]) + abs(cut_away[2]) + abs(cut_away[3])

@@ -45,8 +45,9 @@ def _simulate(
     """Simulate a swing from every state; the states after impact are packed into ``following``.
 
     A lane that has ended its swing takes the next state. No swing is begun after
-    ``most_evaluations``. Returns how many states were simulated, how many steps succeeded,
-    integrator steps and evaluations.
+    ``most_evaluations``; those are dropped that only begun since they were under way at once, so
+    that what is left does not depend on the number of lanes. Returns how many states were
+    simulated, how many steps succeeded, integrator steps and evaluations.
     """
     n, m = outcomes.shape
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
@@ -61,7 +62,7 @@ def _simulate(
     of = np.full(LANES, -1)  # which state's swing each lane holds
     trace = np.zeros((0, 0))
     started = 0
-    steps = 0
+    costs = np.zeros((n, 2), np.int64)  # integrator steps and evaluations
     evaluations = 0
     while True:
         for lane in range(LANES):
@@ -70,7 +71,7 @@ def _simulate(
             k = of[lane]
             if k >= 0:
                 of[lane] = -1
-                steps += int(v[STEPS, lane])
+                costs[k, 0], costs[k, 1] = int(v[STEPS, lane]), int(v[EVALUATIONS, lane])
                 for i in range(m):
                     outcomes[k, i] = lane_outcomes[lane, i]
                     durations[k, i] = results[lane, 0, i]
@@ -98,14 +99,17 @@ def _simulate(
         if not active.any():
             break
         advance(scheme, rob, par, w, v, active, ground, lane_outcomes, results, after, trace)
-    evaluations += int(v[EVALUATIONS].sum())
-    count = 0
-    for k in range(started):
+    count = done = steps = evaluations = 0
+    while done < started and (done == 0 or evaluations < most_evaluations):
+        steps += costs[done, 0]
+        evaluations += costs[done, 1]
+        done += 1
+    for k in range(done):
         for i in range(m):
             if outcomes[k, i] == _STEP:
                 following[count] = following[k * m + i]
                 count += 1
-    return started, count, steps, evaluations
+    return done, count, steps, evaluations
 
 
 @dataclass(frozen=True)
