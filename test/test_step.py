@@ -363,7 +363,9 @@ from biped_mfpt_ros.gait.step import simulate_steps
 from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker.robot import WalkerModel
 digest = hashlib.sha256()
-for name, most in (("hzd/base", None), ("hzd/mfpt", 5000), ("smc/cot", None), ("spline/base", 99)):
+for name, most in (
+    ("hzd/base", None), ("hzd/mfpt", 5000), ("smc/mfpt", 100_000), ("spline/base", None)
+):
     steps = simulate_steps(*reachable(name, 1), SLOPES, WalkerModel(slip_duration=0.008), most)
     for part in (steps.outcomes, steps.next_states, steps.durations, steps.energies):
         digest.update(part.tobytes())
