@@ -1,5 +1,6 @@
 """The nodes as processes: the same mesh from any number of simulators, faults, clean stops."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -8,8 +9,9 @@ import time
 import pytest
 from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.msg import MfptEstimate
-from ros_graph import STARTING, Client, ros_graph, wait_for
+from ros_graph import DOMAIN, STARTING, Client, ros_graph, wait_for
 
+from biped_mfpt_ros import cli
 from biped_mfpt_ros.chain.mesh import grow_mesh
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
@@ -172,3 +174,39 @@ def test_a_process_ends_in_time_whatever_holds_the_interpreter():
     ended = subprocess.run([sys.executable, "-c", code], timeout=20.0, check=False)
     assert ended.returncode == 0
     assert time.monotonic() - start > 1.0
+
+
+@pytest.mark.parametrize(
+    ("ending", "code"),
+    [
+        ("return 0", 0),
+        ("raise cli.CommandError('in vain')", cli.EXIT_FAILED),
+        ("raise KeyboardInterrupt", cli.EXIT_STOPPED),
+    ],
+)
+def test_a_command_ends_as_it_should_although_leaving_the_graph_takes_for_ever(ending, code):
+    program = f"""
+import re, sys
+from rclpy.node import Node
+from biped_mfpt_ros import cli
+from biped_mfpt_ros.cli import single
+from biped_mfpt_ros.cli.client import Client
+
+def command(args):
+    with Client("/alone", lambda: None):
+        pass
+    print("all of it")
+    {ending}
+
+single.cycle = command
+Node.destroy_node = lambda self: re.match("(a+)+b", "a" * 60)
+sys.exit(cli.main(["cycle"]))
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)},
+        capture_output=True, text=True, timeout=30.0, check=False,
+    )  # fmt: skip
+    assert ended.returncode == code, ended.stderr
+    assert ended.stdout == "all of it\n"
+    assert ("in vain" in ended.stderr) == (code == cli.EXIT_FAILED)

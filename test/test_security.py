@@ -107,7 +107,7 @@ def test_policies_allow_what_the_nodes_have_and_nothing_else(tmp_path):
                         unmet -= matching
                     assert not unmet, f"{name} need not {kind} {unmet}"
         finally:
-            run.__exit__()
+            run.leave()
     assert {f"/{topic}" for topic in recorder.TOPICS} <= allowed("recorder")["subscribe"]
 
 

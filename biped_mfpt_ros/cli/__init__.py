@@ -7,12 +7,16 @@ import importlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from biped_mfpt_ros.cli.parser import make_parser
 from biped_mfpt_ros.errors import InputError
 
 _OWN = __name__.partition(".")[0] + "."
+
+leaving: list[Callable[[], object]] = []
+"""What leaves the ROS graph, when a command has said and written all that it had to: the middleware
+may lock up the process then, for good."""
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_STOPPED = 1, 2, 130
 
@@ -34,6 +38,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit code: 0 done, 1 could not be done, 2 bad input, 130 stopped by SIGINT or SIGTERM.
     """
+    code = _main(arguments)
+    leave_graph(code)
+    return code
+
+
+def leave_graph(code: int) -> None:
+    """Leave the ROS graph, if this process is on it; or, within 3 s, the process with this code."""
+    if not leaving:
+        return
+    from biped_mfpt_ros.nodes.spin import LAST_SECONDS, end_within
+
+    call_off = end_within(LAST_SECONDS, code)
+    try:
+        while leaving:
+            leaving.pop()()
+    finally:
+        call_off()
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     try:
         args = make_parser().parse_args(arguments)
     except SystemExit as end:  # --help, --version, or bad input that has been reported

@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from biped_mfpt_ros.cli import CommandError
+from biped_mfpt_ros.cli import CommandError, leaving
 from biped_mfpt_ros.nodes.fair_service import client_name
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
@@ -51,6 +51,8 @@ class AnalysisFailed(CommandError):
 class Client:
     """Client of a pipeline in one namespace. Use it as a context manager.
 
+    It leaves the graph at the end of the command, see `leaving`.
+
     Parameters
     ----------
     namespace : str
@@ -73,7 +75,8 @@ class Client:
         self._name = client_name(self._node)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._grow = ActionClient(self._node, GrowMesh, "grow_mesh")
+        self._actions: list[ActionClient[Any, Any, Any]] = []
+        self._grow = self._action(GrowMesh, "grow_mesh")
         self._compute = self._node.create_client(ComputeMfpt, "compute_mfpt", qos_profile=REQUESTS)
         self._estimates: list[MfptEstimate] = []
         self._node.create_subscription(MfptEstimate, "mfpt", self._estimates.append, RESULTS)
@@ -83,11 +86,23 @@ class Client:
         return self
 
     def __exit__(self, *exc: object) -> None:
+        """Leave the graph, once that may take as long as it likes."""
+        leaving.append(self.leave)
+
+    def leave(self) -> None:
         """Leave the graph."""
+        nodes = self._executor.get_nodes()
         self._executor.shutdown(timeout_sec=0.0)
-        self._grow.destroy()
-        self._node.destroy_node()
+        for action in self._actions:
+            action.destroy()
+        for node in nodes:
+            node.destroy_node()
         rclpy.try_shutdown(context=self._context)
+
+    def _action(self, kind: Any, name: str) -> ActionClient[Any, Any, Any]:
+        """A client of an action, to be destroyed at the end."""
+        self._actions.append(ActionClient(self._node, kind, name))
+        return self._actions[-1]
 
     def add(self, make: Callable[..., Node], name: str, **parameters: object) -> Node:
         """Make a node of this namespace, and serve it too whenever the client waits.
@@ -131,9 +146,17 @@ class Client:
             ),
         )
 
-    def sees(self, node: str) -> bool:
-        """Whether a node is there."""
-        return node in self._node.get_node_names()
+    def reaches(self, mesher: str) -> bool:
+        """Whether goals get to a mesher and their answers back, also beside one that was killed.
+
+        Of what a mesher's action has, its status is announced last. That the node is there says
+        little: an answer to who asks before the rest is there gets lost.
+        """
+        status = self._node.resolve_topic_name("grow_mesh/_action/status")
+        announced = self._node.get_publishers_info_by_topic(status)
+        return (
+            any(info.node_name == mesher for info in announced) and self._grow.server_is_ready()
+        )
 
     def listens(self, node: str, topics: Sequence[str]) -> bool:
         """Whether a node of the pipeline is subscribed to all of some topics."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from biped_mfpt_msgs.action import Optimise
-from rclpy.action import ActionClient
 
 from biped_mfpt_ros.cli import CommandError
 from biped_mfpt_ros.cli.client import Client
@@ -65,11 +64,7 @@ class _Client(Client):
 
     def __init__(self, namespace: str, watch: Callable[[], object]) -> None:
         super().__init__(namespace, watch)
-        self._optimise = ActionClient(self._node, Optimise, "optimise")
-
-    def __exit__(self, *exc: object) -> None:
-        self._optimise.destroy()
-        super().__exit__(*exc)
+        self._optimise = self._action(Optimise, "optimise")
 
     def optimiser_is_there(self) -> bool:
         return self._optimise.server_is_ready()

@@ -276,7 +276,7 @@ class Pipeline:
                     break
                 except _MesherKilled:
                     name = self._start_mesher()
-                    client.wait(lambda name=name: client.sees(name), START_TIMEOUT, name)
+                    client.wait(partial(client.reaches, name), START_TIMEOUT, name)
             self._progress.show("waiting for the analysis")
             estimates = client.published_mfpt(grown.mesh_id, mean, list(sigmas), RESULT_TIMEOUT)
             low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)

@@ -23,7 +23,7 @@ from rclpy.signals import (
 
 from biped_mfpt_ros.errors import InputError
 
-_LAST_SECONDS = 3
+LAST_SECONDS = 3
 """s, for the middleware to end in."""
 
 # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h. The first is the most that glibc
@@ -79,30 +79,41 @@ class _Event(ctypes.Structure):
     )
 
 
-def end_within(seconds: int) -> None:
-    """End the process with exit code 0 after a time, whatever it does then.
+def end_within(seconds: int, code: int = 0) -> Callable[[], object]:
+    """End the process after a time, whatever it does then.
 
     Fast DDS can lock itself up while it leaves the graph, when others leave at the same moment:
     its participant waits, busily, for a callback that waits for the participant. It holds the
     interpreter's lock meanwhile, so no thread of Python can help, and no handler of a signal. A
-    timer of the C library calls ``_exit(0)`` from a thread of its own.
+    timer of the C library calls ``_exit`` from a thread of its own.
 
     Parameters
     ----------
     seconds : int
         s, from now.
+    code : int, optional
+        Exit code.
+
+    Returns
+    -------
+    callable
+        Calls it off.
     """
     library = ctypes.CDLL(None)
-    create, start = (getattr(library, f"timer_{name}", None) for name in ("create", "settime"))
-    if create is None or start is None:
-        return
+    try:
+        create, start, delete = library.timer_create, library.timer_settime, library.timer_delete
+    except AttributeError:
+        return lambda: None
     sigev_thread, monotonic = 2, 1
     function = ctypes.cast(library._exit, ctypes.c_void_p)
-    event = _Event(value=0, notify=sigev_thread, function=function)
+    # The value is what the function is called with.
+    event = _Event(value=code, notify=sigev_thread, function=function)
     timer = ctypes.c_void_p()
-    if create(monotonic, ctypes.byref(event), ctypes.byref(timer)) == 0:
-        # Interval and first expiry, each in s and ns.
-        start(timer, 0, (ctypes.c_long * 4)(0, 0, seconds, 0), None)
+    if create(monotonic, ctypes.byref(event), ctypes.byref(timer)) != 0:
+        return lambda: None
+    # Interval and first expiry, each in s and ns.
+    start(timer, 0, (ctypes.c_long * 4)(0, 0, seconds, 0), None)
+    return lambda: delete(timer)
 
 
 @contextmanager
@@ -184,7 +195,7 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
             close = getattr(node, "close", None)
             if close is not None:
                 close()
-            end_within(_LAST_SECONDS)
+            end_within(LAST_SECONDS)
         if executor is not None:
             executor.shutdown()
         if node is not None:

@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Callable
 
+from biped_mfpt_ros.cli import leave_graph
 from biped_mfpt_ros.report.progress import Progress
 from biped_mfpt_ros.report.tables import table
 from biped_mfpt_ros.soak.result import Row
@@ -43,7 +44,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(json.dumps({"seed": args.seed, "rows": found, "failures": failures}, indent=2))
     else:
         print(_text(rows))
-    return int(failures > 0)
+    sys.stdout.flush()
+    code = int(failures > 0)
+    leave_graph(code)
+    return code
 
 
 def _text(rows: list[Row]) -> str:
