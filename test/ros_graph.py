@@ -176,20 +176,20 @@ class Client(Node):
         callback = None if feedback is None else lambda m: feedback(m.feedback.progress)
         return result_of(self._grow.send_goal_async(goal, feedback_callback=callback))
 
-    def send_goal_to(self, node, settings):
+    def send_goal_to(self, mesher, settings):
         """Handle of a goal for a mesher by the name of its node.
 
         One that was killed before is on the graph for some time, so that being ready means little.
         """
-        wait_for(lambda: node in self.get_node_names(), node, STARTING)
-        # Its services follow some tenths of a second later. An answer to who asks before that gets
-        # lost, and the goal that is sent again finds the journal in use by the first one.
-        time.sleep(1.0)
-        goal = GrowMesh.Goal(settings=settings_message(settings))
-        for _ in range(10):
-            with suppress(AssertionError):
-                return result_of(self._grow.send_goal_async(goal), 3.0)
-        raise AssertionError(f"{node} answers no goal")
+
+        def reached():
+            announced = self.get_publishers_info_by_topic("/grow_mesh/_action/status")
+            return any(i.node_name == mesher for i in announced) and self._grow.server_is_ready()
+
+        wait_for(reached, mesher, STARTING)
+        return result_of(
+            self._grow.send_goal_async(GrowMesh.Goal(settings=settings_message(settings)))
+        )
 
     def grow(self, settings, feedback=None):
         """Status and result of a goal."""

@@ -6,10 +6,14 @@ import time
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MeshInfo
-from ros_graph import Client, ros_graph, wait_for
+from rclpy.action import ActionServer
+from rclpy.node import Node
+from ros_graph import DOMAIN, Client, ros_graph, wait_for
 from test_nodes import assert_same_mesh, grown_here, settings
 
+from biped_mfpt_ros.cli import client as cli
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.nodes.mesher import Mesher
@@ -58,6 +62,24 @@ def launch(graph, name, directory):
         "mesher", "--ros-args", "-r", f"__node:={name}", "-p", f"checkpoint_directory:={directory}",
         "-p", "chunk_seconds:=0.001", "-p", "simulator_wait_seconds:=60.0",
     )  # fmt: skip
+
+
+def test_a_mesher_is_reached_when_all_of_its_action_is_there(graph):
+    """Not when its node is, which has to compile before it takes goals."""
+    graph.start(Mesher)
+    other = graph.start(lambda: Node("mesher_2"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+        client = cli.Client("/", lambda: None)
+    try:
+        wait_for(lambda: client.reaches("mesher"), "the mesher")
+        wait_for(lambda: "mesher_2" in client._node.get_node_names(), "the other node")
+        assert not client.reaches("mesher_2")
+        action = ActionServer(other, GrowMesh, "grow_mesh", lambda goal: None)
+        wait_for(lambda: client.reaches("mesher_2"), "the other mesher")
+        action.destroy()
+    finally:
+        client.leave()
 
 
 def journals(directory):

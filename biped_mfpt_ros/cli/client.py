@@ -154,9 +154,7 @@ class Client:
         """
         status = self._node.resolve_topic_name("grow_mesh/_action/status")
         announced = self._node.get_publishers_info_by_topic(status)
-        return (
-            any(info.node_name == mesher for info in announced) and self._grow.server_is_ready()
-        )
+        return any(info.node_name == mesher for info in announced) and self._grow.server_is_ready()
 
     def listens(self, node: str, topics: Sequence[str]) -> bool:
         """Whether a node of the pipeline is subscribed to all of some topics."""
