@@ -55,10 +55,10 @@ class Nodes:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._node = Node("client", namespace=self.namespace, context=self._context)
+        self.node = Node("client", namespace=self.namespace, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._grow = ActionClient(self._node, GrowMesh, "grow_mesh")
+        self._executor.add_node(self.node)
+        self._grow = ActionClient(self.node, GrowMesh, "grow_mesh")
         self._meshes: dict[str, MeshAssembly] = {}
         if listen:
             for kind, topic, add in (
@@ -66,7 +66,7 @@ class Nodes:
                 (MeshStates, "mesh/states", MeshAssembly.add_states),
                 (MeshTransitions, "mesh/transitions", MeshAssembly.add_transitions),
             ):
-                self._node.create_subscription(kind, topic, self._adder(add), RESULTS)
+                self.node.create_subscription(kind, topic, self._adder(add), RESULTS)
 
     def _adder(self, add: Callable[[MeshAssembly, Any], None]) -> Callable[[Any], None]:
         def receive(message: Any) -> None:
@@ -90,7 +90,7 @@ class Nodes:
             end(process, signal.SIGKILL)
         self._executor.shutdown(timeout_sec=0.0)
         self._grow.destroy()
-        self._node.destroy_node()
+        self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
         set_logger_level("", self._log_level)
         self._directory.cleanup()
@@ -119,13 +119,13 @@ class Nodes:
         """Names of the services of simulators on the graph."""
         return {
             name
-            for name, types in self._node.get_service_names_and_types()
+            for name, types in self.node.get_service_names_and_types()
             if SERVICE_TYPE in types and name.startswith(self.namespace)
         }
 
     def names(self) -> list[str]:
         """Names of the nodes on the graph."""
-        return self._node.get_node_names()
+        return self.node.get_node_names()
 
     def spin(self, until: Callable[[], object], timeout: float, what: str) -> None:
         """Take messages until something holds; TimeoutError after ``timeout`` seconds."""
@@ -211,6 +211,19 @@ def cpu_seconds(process: subprocess.Popen[bytes]) -> float:
     """CPU time that a process has used, s."""
     # The clock of a process, as clock_getcpuclockid(3) makes it on Linux: to the nanosecond.
     return time.clock_gettime((~process.pid << 3) | 2)
+
+
+def held(pid: int) -> dict[str, int]:
+    """What a process has now: ``kilobytes`` of memory, open ``files``, ``threads``."""
+    process = Path("/proc", str(pid))
+    status = dict(
+        line.split(":", 1) for line in (process / "status").read_text().splitlines() if ":" in line
+    )
+    return {
+        "kilobytes": int(status["VmRSS"].split()[0]),
+        "files": len(list((process / "fd").iterdir())),
+        "threads": int(status["Threads"]),
+    }
 
 
 def peak_bytes(process: subprocess.Popen[bytes]) -> int:

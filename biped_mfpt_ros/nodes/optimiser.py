@@ -195,7 +195,7 @@ def degrees_of(radians: float) -> float:
 def _named(names: Sequence[str], values: Any, field: str) -> dict[str, float]:
     numbers = unpacked(values, "d").tolist()
     if len(numbers) != len(names):
-        raise InputError(field, f"{len(numbers)} numbers", f"one for each of {list(names)}")
+        raise InputError(field, f"{len(numbers)} numbers", f"as many as names, {len(names)}")
     return dict(zip(names, numbers, strict=True))
 
 

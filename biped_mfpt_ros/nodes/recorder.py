@@ -261,9 +261,8 @@ def _veto(changes: list[Parameter[Any]]) -> SetParametersResult:
     names = RecorderParameters.__dataclass_fields__
     for change in changes:
         if change.name in names:
-            return SetParametersResult(
-                successful=False, reason=f"{change.name}: fixed while recording"
-            )
+            error = InputError(change.name, change.value, "what it is, while it records")
+            return SetParametersResult(successful=False, reason=str(error))
     return SetParametersResult(successful=True)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import re
 import signal
 import sys
 import traceback
@@ -13,7 +14,10 @@ from contextlib import contextmanager
 from types import FrameType
 
 import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.signals import (
     SignalHandlerOptions,
@@ -25,6 +29,8 @@ from biped_mfpt_ros.errors import InputError
 
 LAST_SECONDS = 3
 """s, for the middleware to end in."""
+
+_BAD_ARGUMENTS = (_rclpy.RCLError, _rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError)
 
 # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h. The first is the most that glibc
 # takes; the others bound what a heap keeps.
@@ -133,6 +139,38 @@ def security_explained() -> Iterator[None]:
         ) from error
 
 
+def initialise(args: list[str] | None = None, context: Context | None = None) -> None:
+    """Start rclpy without its signal handlers.
+
+    Parameters
+    ----------
+    args : list of str, optional
+        Arguments with ROS remappings and parameters; the command line by default.
+    context : rclpy.context.Context, optional
+        What to start; the default one by default.
+
+    Raises
+    ------
+    InputError
+        If the arguments, or a file of parameters that they name, cannot be read.
+    """
+    try:
+        rclpy.init(args=args, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except _BAD_ARGUMENTS as error:
+        if os.environ.get("ROS_SECURITY_ENABLE", "").lower() == "true":
+            raise  # `security_explained`
+        # After what is wrong rcl tells the line of its own source that found it.
+        problem = re.sub(r",?\s+at /\S+:\d+", "", str(error)).strip()
+        found = re.search(r"'--params-file (.*?)'\. Error: (.*)", problem, re.DOTALL)
+        if found is not None:
+            file, problem = found.groups()
+            raise InputError(
+                "--params-file", file, f"a YAML file of parameters as ROS 2 reads it ({problem})"
+            ) from error
+        given = sys.argv[1:] if args is None else args
+        raise InputError("--ros-args", given, f"what ROS 2 takes ({problem})") from error
+
+
 class _Interrupt:
     """Signal handler that raises KeyboardInterrupt until it is told to hold."""
 
@@ -174,7 +212,7 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
         prepare_environment()
         keep_freed_memory()
         with security_explained():
-            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            initialise(args)
             node = make()
         executor = SingleThreadedExecutor()
         install_signal_handlers(SignalHandlerOptions.ALL)
@@ -183,7 +221,7 @@ def run_node(make: Callable[[], Node], args: list[str] | None = None) -> int:
             _spin(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except InputError as error:
+    except (InputError, ParameterException) as error:
         print(f"{sys.argv[0]}: {error}", file=sys.stderr)
         return 2
     finally:

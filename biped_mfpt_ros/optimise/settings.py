@@ -137,7 +137,9 @@ class StudySettings:
         _check("searcher", self.searcher, self.searcher in SEARCHERS, ", ".join(SEARCHERS))
         _check("seed", self.seed, self.seed >= 0, ">= 0")
         _check("step", self.step, 0.0 < self.step < math.inf, "> 0")
-        _check("population", self.population, 0 <= self.population <= 100_000, "0 to 100000")
+        # CMA-ES learns from the difference between two at least.
+        most, size = 100_000, self.population
+        _check("population", size, size == 0 or 2 <= size <= most, f"0, or 2 to {most}")
         _check("objectives", list(self.objectives), bool(self.objectives), "at least one")
         for name, weight in self.objectives.items():
             _check("objectives", name, name in OBJECTIVES, ", ".join(OBJECTIVES))
@@ -155,8 +157,12 @@ class StudySettings:
             _check("mu_s", self.mu_s, abs(self.mu_s) <= slopes[-1], "within the slope set")
             _check("threshold", stage.threshold, 0.0 < stage.threshold < math.inf, "> 0")
             _check("max_states", stage.max_states, stage.max_states >= 2, ">= 2")
+            _check("margin", stage.margin, not math.isnan(stage.margin), "a number")
+        for sigma in self.check_sigmas:
+            _check("check_sigmas", sigma, 0.0 < sigma < math.inf, "numbers > 0")
+        _check("check_steps", self.check_steps, 1.0 <= self.check_steps < math.inf, ">= 1")
         _check("check_walks", self.check_walks, self.check_walks >= 1, ">= 1")
-        _check("trial_seconds", self.trial_seconds, self.trial_seconds > 0.0, "> 0 s")
+        _check("trial_seconds", self.trial_seconds, 0.0 < self.trial_seconds < math.inf, "> 0 s")
 
     @cached_property
     def slopes(self) -> tuple[np.ndarray, ...]:

@@ -7,7 +7,7 @@ is allowed. Anything else is a failure, and so is to take too long over it, or m
 
 from __future__ import annotations
 
-import resource
+import os
 import time
 import traceback
 from collections.abc import Callable
@@ -15,11 +15,12 @@ from random import Random
 
 import numpy as np
 
+from biped_mfpt_ros.bench.nodes import held
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.nodes import analysis, mesher
 from biped_mfpt_ros.report.progress import Progress
-from biped_mfpt_ros.soak import targets
-from biped_mfpt_ros.soak.result import Row
+from biped_mfpt_ros.soak import live, targets
+from biped_mfpt_ros.soak.result import PromiseBroken, Row
 
 INPUTS = 110_000
 """Of a whole run, over all targets."""
@@ -33,6 +34,10 @@ MOST_SECONDS = 5.0
 MOST_GROWTH = 32e6
 """Bytes that the process may grow by, after the first third of a target's inputs. A leak of 1 kB
 an input shows; what the allocator keeps for reuse does not."""
+
+MOST_HANDLES = 4
+"""Open files and threads that a node may have more in the end: threads of a pool start with what
+they do first."""
 
 _EXAMPLES = 5
 
@@ -51,10 +56,11 @@ def run(short: bool, seed: int, progress: Progress) -> list[Row]:
     warm_up()
     most = SHORT_INPUTS if short else INPUTS
     total = sum(target.share for target in targets.TARGETS)
-    return [
+    rows = [
         run_target(target, max(1, round(most * target.share / total)), seed, progress)
         for target in targets.TARGETS
     ]
+    return rows + run_live(live.SHORT_INPUTS if short else live.INPUTS, seed, progress)
 
 
 def run_target(target: targets.TargetEntry, inputs: int, seed: int, progress: Progress) -> Row:
@@ -64,7 +70,41 @@ def run_target(target: targets.TargetEntry, inputs: int, seed: int, progress: Pr
         return fuzz(target.name, give, inputs, seed, progress)
 
 
-def fuzz(name: str, give: Target, inputs: int, seed: int, progress: Progress) -> Row:
+def run_live(inputs: int, seed: int, progress: Progress) -> list[Row]:
+    """Fuzz every target of nodes that run, then look whether these are well, and end them."""
+    total = sum(share for _, share, _ in live.TARGETS)
+    rows = []
+    with live.live() as nodes:
+        before = nodes.held()
+        for name, share, make in live.TARGETS:
+            with make(nodes) as give:
+                most = max(1, round(inputs * share / total))
+                rows.append(fuzz(name, give, most, seed, progress, nodes.memory))
+        start = time.monotonic()
+        problems = []
+        try:
+            nodes.check_well()
+            for name, now in nodes.held().items():
+                problems += [
+                    f"{name}: {before[name][what]} {what} became {now[what]}"
+                    for what in ("files", "threads")
+                    if now[what] > before[name][what] + MOST_HANDLES
+                ]
+            nodes.end()
+        except PromiseBroken as error:
+            problems.append(str(error))
+    seconds = time.monotonic() - start
+    return [*rows, Row("fuzz", "the nodes after it", 1, len(problems), seconds, {}, problems)]
+
+
+def fuzz(
+    name: str,
+    give: Target,
+    inputs: int,
+    seed: int,
+    progress: Progress,
+    memory: Callable[[], dict[str, float]] | None = None,
+) -> Row:
     """Give one target many inputs.
 
     Parameters
@@ -79,6 +119,8 @@ def fuzz(name: str, give: Target, inputs: int, seed: int, progress: Progress) ->
         Input ``i`` is made from the seed ``"NAME SEED i"``, so that any one can be made again.
     progress : Progress
         Told how far it is.
+    memory : callable, optional
+        Tells the bytes that whatever must not grow has now, by its name; this process by default.
 
     Returns
     -------
@@ -87,11 +129,12 @@ def fuzz(name: str, give: Target, inputs: int, seed: int, progress: Progress) ->
     failures: list[str] = []
     refused = 0
     slowest, slowest_input = 0.0, 0
-    memory = 0.0
+    memory = memory or _memory
+    kept: dict[str, float] = {}
     start = time.monotonic()
     for i in range(inputs):
         if i == inputs // 3:
-            memory = _memory()
+            kept = memory()
         progress.count(f"fuzz: {name}", i, inputs, "inputs")
         before = time.process_time()
         try:
@@ -108,9 +151,12 @@ def fuzz(name: str, give: Target, inputs: int, seed: int, progress: Progress) ->
             slowest, slowest_input = seconds, i
         if seconds > MOST_SECONDS:
             failures.append(f"input {i}: took {seconds:.1f} s")
-    growth = _memory() - memory
-    if growth > MOST_GROWTH:
-        failures.append(f"the process grew by {growth / 1e6:.0f} MB after the first third")
+    growths = {who: now - kept[who] for who, now in memory().items()}
+    failures += [
+        f"{who} grew by {growth / 1e6:.0f} MB after the first third"
+        for who, growth in growths.items()
+        if growth > MOST_GROWTH
+    ]
     return Row(
         "fuzz",
         name,
@@ -121,7 +167,7 @@ def fuzz(name: str, give: Target, inputs: int, seed: int, progress: Progress) ->
             "refused": refused,
             "slowest_seconds": round(slowest, 3),
             "slowest_input": slowest_input,
-            "growth_megabytes": round(growth / 1e6, 1),
+            "growth_megabytes": round(max(growths.values()) / 1e6, 1),
         },
         failures[:_EXAMPLES],
     )
@@ -137,7 +183,6 @@ def unclear(error: InputError) -> str:
     return ""
 
 
-def _memory() -> float:
-    """Bytes of memory that this process has now."""
-    with open("/proc/self/statm") as file:
-        return float(int(file.read().split()[1]) * resource.getpagesize())
+def _memory() -> dict[str, float]:
+    """Bytes that this process has now."""
+    return {"the process": 1e3 * held(os.getpid())["kilobytes"]}

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from random import Random
 from typing import Any
 
+import numpy as np
+
 _NUMBERS = (
     math.nan, math.inf, -math.inf, 0.0, -0.0, 1.0, -1.0, 5e-324, -5e-324, 1e-300, 1e-12, 1e12,
     1e154, -1e300, 1.7976931348623157e308, 2.0**53, 2.0**63, -(2.0**63), 0.1, math.pi,
@@ -118,6 +120,8 @@ def _spoil_one(random: Random, message: Any) -> None:
             setattr(message, name, changed if code is None else array(code, changed))
     elif "/" in kind:
         _spoil_one(random, value)
+    elif kind.endswith("]"):  # an array of fixed length: a name of a goal
+        setattr(message, name, np.frombuffer(random.randbytes(value.nbytes), value.dtype))
     else:
         setattr(message, name, _scalar(random, kind, value))
 

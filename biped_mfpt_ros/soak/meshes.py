@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from biped_mfpt_ros.bench.nodes import held
 from biped_mfpt_ros.cli.client import Client
 from biped_mfpt_ros.cli.processes import Child, Processes
 from biped_mfpt_ros.control.controller import controller
@@ -71,7 +72,7 @@ def run(short: bool, seed: int, progress: Progress) -> list[Row]:
                 seconds[i] = time.monotonic() - before
                 if i % 2 == 0:
                     estimates.add(found[0].mfpt)
-                looks.append({child.name: _look(child) for child in children})
+                looks.append({child.name: held(child.process.pid) for child in children})
         shared = {path for child in children for path in _shared_memory(child)}
         nodes.stop()
         whole = (bag / "metadata.yaml").exists()
@@ -89,19 +90,6 @@ def _node(
     command = [sys.executable, "-m", "biped_mfpt_ros.cli", "node", "--end-with", str(os.getpid())]
     command += [name, "--ros-args", "-r", f"__ns:={namespace}", "-r", "/rosout:=rosout"]
     return processes.start(name, [*command, *parameters], last=last)
-
-
-def _look(child: Child) -> dict[str, int]:
-    """What a process holds: memory in kB, open files, threads."""
-    process = Path("/proc", str(child.process.pid))
-    status = dict(
-        line.split(":", 1) for line in (process / "status").read_text().splitlines() if ":" in line
-    )
-    return {
-        "kilobytes": int(status["VmRSS"].split()[0]),
-        "files": len(list((process / "fd").iterdir())),
-        "threads": int(status["Threads"]),
-    }
 
 
 def _shared_memory(child: Child) -> set[str]:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,10 +15,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from random import Random
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from biped_mfpt_msgs import msg
 from biped_mfpt_msgs.srv import SimulateSteps
+from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
 from biped_mfpt_ros.bag.definitions import message_definition
@@ -37,18 +41,20 @@ from biped_mfpt_ros.nodes import messages
 from biped_mfpt_ros.nodes.analysis import AnalysisParameters
 from biped_mfpt_ros.nodes.assembly import IncompleteMesh, MeshAssembly
 from biped_mfpt_ros.nodes.mesher import MesherParameters
-from biped_mfpt_ros.nodes.parameters import NodeParameters
+from biped_mfpt_ros.nodes.optimiser import OptimiserParameters
+from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters
 from biped_mfpt_ros.nodes.recorder import RecorderParameters
 from biped_mfpt_ros.nodes.simulator import SimulatorParameters
+from biped_mfpt_ros.nodes.spin import initialise
 from biped_mfpt_ros.soak import inputs
 from biped_mfpt_ros.soak.result import check
 from biped_mfpt_ros.walker.robot import WalkerModel
 from biped_mfpt_ros.walker.terrain import slope_set
 
-_MOST_STATES, _MOST_OUTCOMES, _MOST_EVALUATIONS = 8, 256, 50_000
+_MOST_STATES, _MOST_OUTCOMES, MOST_EVALUATIONS = 8, 256, 50_000
 
 # The paper's limit cycle of hzd/base on flat ground, rounded: a state that takes a step.
-_STATE = (
+STATE = (
     3.615120, 3.034901, -0.416229, -0.319996, -0.015846,
     0.374090, -1.916832, -3.562034, 1.022692, 0.140844,
 )  # fmt: skip
@@ -72,12 +78,13 @@ def _controller(random: Random) -> msg.Controller:
     return messages.controller_message(made)
 
 
-def _request(random: Random) -> SimulateSteps.Request:
+def request(random: Random) -> SimulateSteps.Request:
+    """A request to a simulator, with nothing wrong in it."""
     n = random.choice((0, 1, 1, 2))
     return SimulateSteps.Request(
         controller=_controller(random),
         model=messages.model_message(WalkerModel()),
-        states=messages.packed(np.tile(_STATE, (n, 1)), "d"),
+        states=messages.packed(np.tile(STATE, (n, 1)), "d"),
         previous_slopes=messages.packed(np.zeros(n), "d"),
         slopes=messages.packed(_SLOPES, "d"),
         measures=random.random() < 0.5,
@@ -86,18 +93,18 @@ def _request(random: Random) -> SimulateSteps.Request:
 
 def answer_request(random: Random) -> None:
     """A request as the simulator answers it, and its answer as the mesher reads it."""
-    request = inputs.spoil(random, _request(random))
-    asked = messages.steps_request_from(request, _MOST_STATES, _MOST_OUTCOMES)
+    made = inputs.spoil(random, request(random))
+    asked = messages.steps_request_from(made, _MOST_STATES, _MOST_OUTCOMES)
     steps = simulate_steps(
         asked.controller,
         asked.states,
         asked.previous_slopes,
         asked.slopes,
         asked.model,
-        _MOST_EVALUATIONS,
+        MOST_EVALUATIONS,
     )
     response = SimulateSteps.Response()
-    messages.fill_response(response, steps, request.measures)
+    messages.fill_response(response, steps, made.measures)
     back = messages.steps_from(response, len(steps.outcomes), asked.slopes.size)
     check(back.outcomes.tobytes() == steps.outcomes.tobytes())
     check(back.next_states.tobytes() == steps.next_states.tobytes())
@@ -130,7 +137,7 @@ def read_settings(random: Random) -> None:
         WalkerModel(),
         _SLOPES,
         0.3,
-        initial_state=np.array(_STATE) if random.random() < 0.5 else None,
+        initial_state=np.array(STATE) if random.random() < 0.5 else None,
     )
     settings = messages.settings_from(inputs.spoil(random, messages.settings_message(made)))
     again = messages.settings_from(messages.settings_message(settings))
@@ -158,7 +165,7 @@ def _made_up_mesh() -> Mesh:
     return grow_mesh(simulate, np.full(10, 0.1), _SLOPES, 3.0)
 
 
-class _Published:
+class Published:
     """The messages of a mesh, to be spoilt."""
 
     def __init__(self) -> None:
@@ -219,7 +226,7 @@ _ADD = {
 @contextmanager
 def assemble_mesh() -> Iterator[Callable[[Random], None]]:
     """Messages of a mesh, as the analysis puts them together and solves the chain."""
-    published = _Published()
+    published = Published()
 
     def give(random: Random) -> None:
         assembly = MeshAssembly("mesh")
@@ -263,7 +270,7 @@ def _write(path: Path, spread: list[Any], spoil_bytes: Random | None = None) -> 
 @contextmanager
 def inspect_hostile_bag() -> Iterator[Callable[[Random], None]]:
     """A whole bag with messages that cannot be."""
-    published = _Published()
+    published = Published()
     with tempfile.TemporaryDirectory() as directory:
 
         def give(random: Random) -> None:
@@ -278,7 +285,7 @@ def inspect_hostile_bag() -> Iterator[Callable[[Random], None]]:
 @contextmanager
 def read_damaged_bag() -> Iterator[Callable[[Random], None]]:
     """A bag with damaged bytes: what is read of it is what was written, and it is never changed."""
-    published = _Published()
+    published = Published()
     with tempfile.TemporaryDirectory() as directory:
         whole = Path(directory, "whole")
         _write(whole, published.make(Random(3)))
@@ -311,15 +318,17 @@ def read_damaged_bag() -> Iterator[Callable[[Random], None]]:
 
 # Parameters, files, command line -------------------------------------------------------------
 
-_PARAMETERS: tuple[type[NodeParameters], ...] = (
-    SimulatorParameters,
-    MesherParameters,
-    AnalysisParameters,
-    RecorderParameters,
-)
+PARAMETERS: dict[str, type[NodeParameters]] = {
+    "simulator": SimulatorParameters,
+    "mesher": MesherParameters,
+    "analysis": AnalysisParameters,
+    "optimiser": OptimiserParameters,
+    "recorder": RecorderParameters,
+}
+"""Of each node."""
 
 
-def _value(random: Random) -> Any:
+def value(random: Random) -> Any:
     """Anything that a parameter of ROS can be."""
     kind = random.randrange(7)
     if kind == 0:
@@ -339,13 +348,49 @@ def _value(random: Random) -> Any:
 
 def set_parameters(random: Random) -> None:
     """Values of a node's parameters."""
-    kind = random.choice(_PARAMETERS)
+    kind = random.choice([*PARAMETERS.values()])
     names = [field.name for field in fields(kind)]
-    given = {name: _value(random) for name in random.sample(names, random.randint(1, 2))}
+    given = {name: value(random) for name in random.sample(names, random.randint(1, 2))}
     made = kind(**given)
     for name in given:
-        value = getattr(made, name)
-        check(not (isinstance(value, float) and math.isnan(value)))
+        taken = getattr(made, name)
+        check(not (isinstance(taken, float) and math.isnan(taken)))
+
+
+_YAML = (
+    ".nan", "-.inf", "1e999", "~", "[]", "[1, 2.5]", "[1, a]", "[[1]]", "{a: 1}", "'x'", "!!int x",
+    "&a [*a]", "99999999999999999999", "0x7f", "yes", "|\n x", "- 1", "",
+)  # fmt: skip
+
+
+@contextmanager
+def read_parameter_file() -> Iterator[Callable[[Random], None]]:
+    """A file of parameters with which a node starts."""
+    # Nobody is to be found, which would take most of the time.
+    alone = patch.dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="OFF")
+    with tempfile.TemporaryDirectory() as directory, alone:
+        path = Path(directory, "parameters.yaml")
+
+        def give(random: Random) -> None:
+            name, kind = random.choice([*PARAMETERS.items()])
+            lines = [f"{random.choice((name, '/**'))}:", "  ros__parameters:"]
+            for field in random.sample(fields(kind), random.randint(1, 2)):
+                given = random.choice(_YAML) if random.random() < 0.7 else value(random)
+                lines.append(f"    {field.name}: {given}")
+            data = "\n".join(lines).encode(errors="replace")
+            path.write_bytes(inputs.spoilt(random, data) if random.random() < 0.3 else data)
+            context = Context()
+            try:
+                initialise(["--ros-args", "--params-file", str(path)], context)
+                node = Node(
+                    name, context=context, start_parameter_services=False, enable_rosout=False
+                )
+                Declared(node, kind)
+                node.destroy_node()
+            finally:
+                context.try_shutdown()
+
+        yield give
 
 
 _WALKER = (
@@ -368,7 +413,7 @@ _COMMANDS = {
 _NEEDED = {
     "mfpt": ["--sigma", "1"],
     "monte-carlo": ["--sigma", "1"],
-    "step": ["--state", ",".join(map(str, _STATE))],
+    "step": ["--state", ",".join(map(str, STATE))],
     "picture": ["gait", "--output", "new.png"],
     "inspect": ["no/such/bag"],
     "node": ["simulator"],
@@ -391,7 +436,7 @@ def _words(random: Random) -> list[str]:
 def _word(random: Random, option: str) -> str:
     kind = random.random()
     if option == "--state":
-        return ",".join(str(inputs.number(random, x)) for x in _STATE)
+        return ",".join(str(inputs.number(random, x)) for x in STATE)
     if option in ("--controller", "--namespace", "--output") or kind < 0.1:
         return inputs.text(random, random.choice(controller_names()))
     return str(inputs.whole(random, 64, True) if kind < 0.4 else inputs.number(random))
@@ -423,7 +468,7 @@ def read_command_line(random: Random) -> None:
         slopes = options.slopes_of(args)
         messages.MeshSettings(walking, model, slopes, args.threshold, **options.mesh_settings(args))
     if "state" in given:
-        simulate_steps(walking, [args.state], [0.0], [0.0], model, _MOST_EVALUATIONS)
+        simulate_steps(walking, [args.state], [0.0], [0.0], model, MOST_EVALUATIONS)
 
 
 @contextmanager
@@ -485,6 +530,7 @@ TARGETS = (
     TargetEntry("messages in a bag", 1.5, inspect_hostile_bag),
     TargetEntry("bytes of a bag", 3, read_damaged_bag),
     TargetEntry("parameters of nodes", 10, _plain(set_parameters)),
+    TargetEntry("parameter files", 0.3, read_parameter_file),
     TargetEntry("command lines", 4, _plain(read_command_line)),
     TargetEntry("results on disk", 5, read_result_file),
 )
