@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import importlib
 import os
 import signal
@@ -88,7 +89,10 @@ def _main(arguments: Sequence[str] | None) -> int:
         raise
     finally:
         for number, handler in handlers.items():
-            signal.signal(number, handler)
+            if stopped:  # the process ends, and may be told to once more, to the last moment
+                atexit.register(signal.signal, number, signal.SIG_IGN)
+            else:
+                signal.signal(number, handler)
 
 
 def _run(args: argparse.Namespace) -> int:
