@@ -15,7 +15,12 @@ from ros_graph import STARTING, result_of, ros_graph, wait_for
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.nodes.analysis import Analysis
 from biped_mfpt_ros.nodes.mesher import Mesher
-from biped_mfpt_ros.nodes.optimiser import Optimiser, goal_message, settings_from
+from biped_mfpt_ros.nodes.optimiser import (
+    MOST_REFUSED,
+    Optimiser,
+    goal_message,
+    settings_from,
+)
 from biped_mfpt_ros.nodes.qos import LATEST, RESULTS
 from biped_mfpt_ros.nodes.simulator import Simulator
 from biped_mfpt_ros.optimise.local import LocalBackend
@@ -160,6 +165,34 @@ def test_a_cancelled_study_goes_on_later(client, store_path, tmp_path):
     goal.max_trials = max(20, answer.result.trials)
     assert client.run(goal).result.success
     assert outline(kept(store_path, "two")) == locally(tmp_path / "l.sqlite", goal.max_trials)
+
+
+def test_a_flood_of_goals_and_cancels_leaves_a_study_alone(client, store_path, tmp_path):
+    client.trials.clear()
+    running = client.send(goal_message("flooded", SETTINGS))
+    wait_for(lambda: client.trials, "a trial", 60.0)
+    # In bursts that the queues of an action hold, ten each: the middleware drops the rest.
+    handles = []
+    for _ in range(30):
+        burst = [client.action.send_goal_async(goal_message("more", SETTINGS)) for _ in range(8)]
+        handles += [result_of(future) for future in burst]
+    accepted = [handle for handle in handles if handle.accepted]
+    assert len(accepted) == MOST_REFUSED
+    for handle in accepted:
+        result_of(handle.cancel_goal_async())
+    for handle in accepted:
+        answer = result_of(handle.get_result_async())
+        assert answer.status in (GoalStatus.STATUS_ABORTED, GoalStatus.STATUS_CANCELED)
+        assert "another study is running" in answer.result.message
+    before = len(client.trials)
+    wait_for(lambda: len(client.trials) > before + 5, "more trials of the study", 60.0)
+    result_of(running.cancel_goal_async())
+    answer = result_of(running.get_result_async())
+    assert (answer.status, answer.result.message) == (GoalStatus.STATUS_CANCELED, "stopped")
+    found = outline(kept(store_path, "flooded"))
+    expected = locally(tmp_path / "l.sqlite", 20)
+    assert len(expected) == 20
+    assert found[:20] == expected  # it scored more than those
 
 
 @pytest.mark.parametrize(

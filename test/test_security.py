@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter
 from ros_graph import DOMAIN, ros_graph, wait_for
 from test_package import NODES
 
-from biped_mfpt_ros.cli.client import Client
+from biped_mfpt_ros.cli import optimise_pipeline
 from biped_mfpt_ros.nodes import recorder
 from biped_mfpt_ros.nodes.analysis import Analysis
 from biped_mfpt_ros.nodes.mesher import Mesher
@@ -87,7 +87,7 @@ def test_policies_allow_what_the_nodes_have_and_nothing_else(tmp_path):
             patch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
             bag = Parameter("bag", value=str(tmp_path / "bag"))
             node = graph.start(lambda: Recorder(parameter_overrides=[bag]))
-            run = Client("/", lambda: None)
+            run = optimise_pipeline.StudyClient("/", lambda: None)
         try:
             wait_for(lambda: mesher.simulators.found(), "the mesher to find the simulator")
             wait_for(

@@ -59,7 +59,7 @@ class _StudyPipeline(Pipeline):
             self._node(child.name, executable, **parameters)
 
 
-class _Client(Client):
+class StudyClient(Client):
     """Client of the optimiser."""
 
     def __init__(self, namespace: str, watch: Callable[[], object]) -> None:
@@ -67,9 +67,11 @@ class _Client(Client):
         self._optimise = self._action(Optimise, "optimise")
 
     def optimiser_is_there(self) -> bool:
+        """Whether the optimiser answers."""
         return self._optimise.server_is_ready()
 
     def optimise(self, goal: Optimise.Goal, feedback: Callable[[Any], object]) -> str:
+        """Have a study run, telling of each trial (a message); why it ended."""
         handle = self._result(
             self._optimise.send_goal_async(
                 goal, feedback_callback=lambda message: feedback(message.feedback.trial)
@@ -129,7 +131,7 @@ def run_study(
         pipeline.start(workers, mean_deg, [sigma_deg], at_once)
         pipeline.optimiser(store, at_once)
         progress.say(f"running in {directory}, ROS namespace /{label}")
-        with _Client(f"/{label}", pipeline.watch) as client:
+        with StudyClient(f"/{label}", pipeline.watch) as client:
 
             def up() -> bool:
                 there = client.peers()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 import traceback
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -41,6 +43,10 @@ from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.store import Store, Trial
 from biped_mfpt_ros.optimise.study import Study, best_trial
 
+MOST_REFUSED = 64
+"""Goals that are told within 10 s that another study runs; more are rejected without a word."""
+_WITHIN = 10.0  # s, for which rclpy keeps the result of a goal
+
 
 @dataclass(frozen=True)
 class OptimiserParameters(NodeParameters):
@@ -59,7 +65,7 @@ class Optimiser(Node):
     A study runs in threads of its own: they look for limit cycles themselves, and have meshes
     grown by the mesher and solved by the analysis. The executor only takes messages and answers.
     A goal that is not allowed, or comes while another study runs, is accepted and aborted, since a
-    rejection cannot say why.
+    rejection cannot say why; a flood of them is rejected.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -71,14 +77,15 @@ class Optimiser(Node):
         self._best = CountedPublisher(self, OptimisationTrial, "optimisation/best", LATEST)
         self._backend = PipelineBackend(self, lambda: self._declared.now.patience)
         self._stop = threading.Event()
-        self._busy = False
+        self._running: ServerGoalHandle[Any, Any, Any] | None = None
+        self._refused: deque[float] = deque()  # when goals were, while a study ran
         self._thread = ThreadPoolExecutor(1, "study")
         self._action = ActionServer(
             self,
             Optimise,
             "optimise",
             self._execute,
-            goal_callback=lambda goal: GoalResponse.ACCEPT,
+            goal_callback=self._on_goal,
             cancel_callback=self._on_cancel,
         )
         self.get_logger().info("ready")
@@ -90,15 +97,31 @@ class Optimiser(Node):
         self._action.destroy()
         self._backend.close()
 
+    def _on_goal(self, goal: Optimise.Goal) -> GoalResponse:
+        if self._running is None:
+            return GoalResponse.ACCEPT
+        now = time.monotonic()
+        while self._refused and self._refused[0] < now - _WITHIN:
+            self._refused.popleft()
+        if len(self._refused) >= MOST_REFUSED:
+            self.get_logger().warning(
+                f"rejected a goal: {MOST_REFUSED} were told within {_WITHIN:g} s that a study runs",
+                throttle_duration_sec=_WITHIN,
+            )
+            return GoalResponse.REJECT
+        self._refused.append(now)
+        return GoalResponse.ACCEPT
+
     def _on_cancel(self, goal: ServerGoalHandle[Any, Any, Any]) -> CancelResponse:
-        self._stop.set()
+        if goal is self._running:
+            self._stop.set()
         return CancelResponse.ACCEPT
 
     async def _execute(self, goal: ServerGoalHandle[Any, Any, Any]) -> Optimise.Result:
-        if self._busy:
+        if self._running is not None:
             goal.abort()
             return Optimise.Result(message="another study is running; cancel it or wait")
-        self._busy = True
+        self._running = goal
         self._stop.clear()
         done: Future[Optimise.Result] = Future()
 
@@ -109,7 +132,7 @@ class Optimiser(Node):
 
         self._thread.submit(self._serve, goal).add_done_callback(finish)
         result = await done
-        self._busy = False
+        self._running = None
         return result
 
     def _serve(self, goal: ServerGoalHandle[Any, Any, Any]) -> Optimise.Result:

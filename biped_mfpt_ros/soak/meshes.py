@@ -73,7 +73,8 @@ def run(short: bool, seed: int, progress: Progress) -> list[Row]:
                 if i % 2 == 0:
                     estimates.add(found[0].mfpt)
                 looks.append({child.name: held(child.process.pid) for child in children})
-        shared = {path for child in children for path in _shared_memory(child)}
+        shared = {path for child in children for path in _shared_memory(child.process.pid)}
+        shared -= _shared_memory(os.getpid())  # the client leaves at the very end
         nodes.stop()
         whole = (bag / "metadata.yaml").exists()
         left = {path for path in shared if Path(path).exists()}
@@ -92,9 +93,9 @@ def _node(
     return processes.start(name, [*command, *parameters], last=last)
 
 
-def _shared_memory(child: Child) -> set[str]:
+def _shared_memory(pid: int) -> set[str]:
     """Segments of Fast DDS that a process has mapped, without those that belong to ports."""
-    maps = Path("/proc", str(child.process.pid), "maps").read_text()
+    maps = Path("/proc", str(pid), "maps").read_text()
     return {word for word in maps.split() if re.fullmatch(r"/dev/shm/fastdds_[0-9a-f]+", word)}
 
 
