@@ -321,6 +321,11 @@ def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
         ("threshold", {"stages": (Stage(0.5, 0.0),)}),
         ("slope_step_deg", {"stages": (Stage(0.3, 0.1),)}),
         ("step", {"step": 0.0}),
+        ("population", {"population": 1}),
+        ("margin", {"stages": (Stage(0.5, 0.3, math.nan),)}),
+        ("check_sigmas", {"check_sigmas": (1.0, math.nan)}),
+        ("check_steps", {"check_steps": math.nan}),
+        ("trial_seconds", {"trial_seconds": math.inf}),
     ],
 )
 def test_bad_settings_are_refused(field, change):

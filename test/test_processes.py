@@ -135,11 +135,22 @@ def test_pipeline_of_processes(graph, client):
         assert "Traceback" not in written
 
 
-def test_nodes_that_cannot_start_say_why(graph):
-    """Bad parameters, and security that is asked for where there is none."""
+def test_nodes_that_cannot_start_say_why(graph, tmp_path):
+    """Bad parameters and files of them, and security that is asked for where there is none."""
+    files = {"garbage": "a: [1, 2\n b: {", "nan": "/**: {ros__parameters: {max_states: .nan}}"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+
+    def with_file(name):
+        return graph.launch("simulator", "--ros-args", "--params-file", str(tmp_path / name))
+
     cases = [
         (graph.launch("simulator", "--ros-args", "-p", "max_states:=0"), "max_states: 0 is not"),
         (graph.launch("analysis", "--ros-args", "-p", "sigma_s_deg:=[0.0]"), "sigma_s_deg[0]: 0.0"),
+        (with_file("garbage"), "--params-file: "),
+        (with_file("nan"), "max_states: nan is not"),
+        (with_file("missing"), "--params-file: "),
+        (graph.launch("simulator", "--ros-args", "-r", "x"), "--ros-args: "),
         (graph.launch("mesher", ROS_SECURITY_ENABLE="true"), "ROS_SECURITY_STRATEGY: 'Permissive'"),
         (
             graph.launch("mesher", ROS_SECURITY_ENABLE="true", ROS_SECURITY_STRATEGY="Enforce"),
