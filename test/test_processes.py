@@ -215,7 +215,7 @@ sys.exit(cli.main(["cycle"]))
 """
     ended = subprocess.run(
         [sys.executable, "-c", program],
-        env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)},
+        env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "PYTHONUNBUFFERED": ""},
         capture_output=True, text=True, timeout=30.0, check=False,
     )  # fmt: skip
     assert ended.returncode == code, ended.stderr

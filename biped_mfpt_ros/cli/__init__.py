@@ -50,6 +50,7 @@ def leave_graph(code: int) -> None:
         return
     from biped_mfpt_ros.nodes.spin import LAST_SECONDS, end_within
 
+    sys.stdout.flush()  # what is left in there would be lost
     call_off = end_within(LAST_SECONDS, code)
     try:
         while leaving:
