@@ -20,17 +20,17 @@ from biped_mfpt_ros.nodes.mesher import Mesher
 from biped_mfpt_ros.nodes.simulator import Simulator
 
 MFPT = controller("hzd/mfpt")
-CHUNK = 20
 IN_FLIGHT = 2
 
 
 class Counting(Simulator):
     """Counts the states that it simulates, and takes its time for it."""
 
-    count = 0
+    count = largest = 0
 
     def _simulate(self, request, response):
         self.count += len(request.previous_slopes)
+        self.largest = max(self.largest, len(request.previous_slopes))
         time.sleep(0.02)
         return super()._simulate(request, response)
 
@@ -66,8 +66,15 @@ def launch(graph, name, directory):
 
 def test_a_mesher_is_reached_when_all_of_its_action_is_there(graph):
     """Not when its node is, which has to compile before it takes goals."""
+
+    class Other(Node):
+        action = None
+
+        def close(self):
+            self.action.destroy()
+
     graph.start(Mesher)
-    other = graph.start(lambda: Node("mesher_2"))
+    other = graph.start(lambda: Other("mesher_2"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
         client = cli.Client("/", lambda: None)
@@ -75,9 +82,8 @@ def test_a_mesher_is_reached_when_all_of_its_action_is_there(graph):
         wait_for(lambda: client.reaches("mesher"), "the mesher")
         wait_for(lambda: "mesher_2" in client._node.get_node_names(), "the other node")
         assert not client.reaches("mesher_2")
-        action = ActionServer(other, GrowMesh, "grow_mesh", lambda goal: None)
+        other.action = ActionServer(other, GrowMesh, "grow_mesh", lambda goal: None)
         wait_for(lambda: client.reaches("mesher_2"), "the other mesher")
-        action.destroy()
     finally:
         client.leave()
 
@@ -109,7 +115,7 @@ def test_mesher_killed_again_and_again_ends_with_the_same_mesh(
     assert_same_mesh(tester.mesh(result.mesh_id), mesh_here)
     assert result.swings + result.swings_resumed == n
     # At most the chunks in flight were simulated again, for each kill: all else was resumed.
-    in_flight = kills * len(simulators) * IN_FLIGHT * CHUNK
+    in_flight = kills * IN_FLIGHT * sum(s.largest for s in simulators)
     simulated = sum(s.count for s in simulators)
     assert n <= simulated <= n + in_flight
     assert result.swings_resumed > max(0, kills * (n // 8) - in_flight)
