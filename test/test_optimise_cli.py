@@ -91,6 +91,36 @@ def test_what_is_exported_walks(finished, capsys, tmp_path):
     assert "--controller-file" in capsys.readouterr().err
 
 
+def test_a_front_is_confirmed_on_a_finer_mesh(finished, capsys):
+    store = ("--store", str(finished))
+    finer = ("--confirm", "front", *store, "--mesh", "1:0.3:inf:2000", "--check-walks", "20",
+             "--seed", "9", "--tolerance", "1e-7", "--local", "--quiet")  # fmt: skip
+    result = result_of(capsys, "optimise", *finer)
+    assert (result["study"], result["ended"]) == ("front-confirmed", "converged")
+    before = result_of(capsys, "study", "show", "front", *store)
+    after = result_of(capsys, "study", "show", "front-confirmed", *store)
+    # All but how trials are scored is as it was.
+    changed = {k for k, v in before["settings"].items() if after["settings"][k] != v}
+    assert changed == {"searcher", "stages", "seed", "check_walks", "check_sigmas", "model"}
+    assert after["settings"]["start"] == before["settings"]["start"]
+    same = before["settings"]["model"] | {"tolerance": 1e-7}
+    assert after["settings"]["model"] == same != before["settings"]["model"]
+    found = {tuple(t["vector"]): t for t in before["trials"]}
+    assert 0 < len(after["trials"]) < 20
+    for trial in after["trials"]:
+        coarse = found[tuple(trial["vector"])]
+        assert coarse["stage"] == "confirmed"
+        assert coarse["controller"]["parameters"] == trial["controller"]["parameters"]
+        # Tolerances of 1e-7 and 2e-8 a step.
+        assert trial["values"]["cot"] == pytest.approx(coarse["values"]["cot"], rel=1e-5)
+        assert (trial["states"], trial["values"]) != (coarse["states"], coarse["values"])
+    # The same command again has nothing left to do; the study of one objective works as well.
+    assert result_of(capsys, "optimise", *finer)["trials"] == len(after["trials"])
+    assert result_of(capsys, "optimise", "--confirm", "s", *finer[2:])["trials"] > 0
+    assert main(["optimise", "--confirm", "none", *store, "--local"]) == 2
+    assert "one of those in" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("what", ["plot", "front"])
 def test_pictures(finished, capsys, tmp_path, what, monkeypatch):
     from biped_mfpt_ros.report import studies

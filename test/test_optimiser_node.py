@@ -4,6 +4,7 @@ import math
 import signal
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.action import Optimise
@@ -205,6 +206,8 @@ def test_a_flood_of_goals_and_cancels_leaves_a_study_alone(client, store_path, t
         ({"objectives": ["mfpt", "cot"], "weights": [1.0]}, "weights: '1 numbers'"),
         ({"thresholds": [1.0]}, "as many of each"),
         ({"fixed": ["x*"]}, "fixed: 'x*' is not allowed"),
+        ({"candidates": [0.0] * 23}, "candidates: 'length 23'"),
+        ({"candidates": [0.0] * 22}, "candidates"),
         ({"seed": 3, "study": "one"}, "now different: seed"),
     ],
 )
@@ -224,6 +227,18 @@ def test_settings_survive_the_message():
         stages=(Stage(0.1, 0.3), Stage(0.25, 0.03, -0.02)),
     )  # fmt: skip
     assert settings_from(goal_message("x", settings)).as_json() == settings.as_json()
+    given = replace(settings, searcher="given", candidates=((0.1,) * 20, (1.0 / 3.0,) * 20))
+    assert settings_from(goal_message("x", given)).as_json() == given.as_json()
+
+
+def test_given_candidates_are_tried_once_each(client, store_path, tmp_path):
+    vectors = tuple(tuple(v) for v in 0.1 * np.random.default_rng(3).normal(size=(3, 22)))
+    settings = replace(SETTINGS, searcher="given", candidates=vectors)
+    answer = client.run(goal_message("given", settings))
+    assert (answer.result.message, answer.result.trials) == ("converged", 3)
+    found = kept(store_path, "given")
+    assert [tuple(t.vector) for t in found] == list(vectors)
+    assert outline(found) == locally(tmp_path / "l.sqlite", None, settings)
 
 
 def test_a_mesh_that_is_too_large_is_a_fact_about_the_candidate(client, store_path, tmp_path):

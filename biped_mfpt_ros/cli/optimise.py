@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +20,33 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.local import LocalBackend
 from biped_mfpt_ros.optimise.settings import DEFAULT_STAGES, Stage, StudySettings
 from biped_mfpt_ros.optimise.store import Store, Trial
-from biped_mfpt_ros.optimise.study import Study, best_trial
+from biped_mfpt_ros.optimise.study import Study, best_trial, confirming
 from biped_mfpt_ros.report.progress import Progress, duration_text, rate_text
 from biped_mfpt_ros.report.tables import number
 
 
 def optimise(args: argparse.Namespace) -> None:
     """Run a study, or go on with one."""
-    settings = _settings(args)
-    name = args.study or "-".join(
-        [settings.start.name.replace("/", "-"), settings.searcher, f"{args.sigma:g}",
-         str(settings.seed)]
-    )  # fmt: skip
+    store: Store | None = None
+    if args.confirm is None:
+        settings = _settings(args)
+        name = args.study or "-".join(
+            [settings.start.name.replace("/", "-"), settings.searcher, f"{args.sigma:g}",
+             str(settings.seed)]
+        )  # fmt: skip
+    else:
+        store = Store(Path(args.store))
+        other = Study(store, args.confirm)
+        model = replace(other.settings.model, tolerance=options.model_of(args).tolerance)
+        settings = confirming(other, model=model, **_scoring(args))
+        name = args.study or f"{args.confirm}-confirmed"
     workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
     for option, value, least in (("--workers", workers, 1), ("--trials", args.trials, 1)):
         if value is not None and value < least:
             raise InputError(option, value, f"a whole number >= {least}")
     if not args.local:
         require_ros()
-    store = Store(Path(args.store))
+    store = store or Store(Path(args.store))
     study = Study(store, name, settings)
     with work(args.quiet) as progress:
         tally = _Tally(study, progress, workers, args.trials, args.seconds)
@@ -99,13 +108,24 @@ def _over_ros(
     )  # fmt: skip
 
 
-def _settings(args: argparse.Namespace) -> StudySettings:
+def _scoring(args: argparse.Namespace) -> dict[str, Any]:
+    """How trials are scored: all that a study that confirms another one has of its own."""
     stages: tuple[Stage, ...] = DEFAULT_STAGES
     if args.mesh is not None:
         stages = tuple(_stage(i, parts) for i, parts in enumerate(args.mesh))
     if args.check_walks < 0:
         raise InputError("--check-walks", args.check_walks, "a whole number >= 0")
-    given: dict[str, Any] = {} if args.check_walks else {"check_sigmas": ()}
+    return {
+        "seed": args.seed,
+        "stages": stages,
+        "slope_limit_deg": args.slope_limit,
+        "check_sigmas": StudySettings.check_sigmas if args.check_walks else (),
+        "check_walks": args.check_walks or 1,
+        "trial_seconds": args.trial_seconds,
+    }
+
+
+def _settings(args: argparse.Namespace) -> StudySettings:
     start, model = options.controller_of(args), options.model_of(args)
     if args.as_spline:
         from biped_mfpt_ros.optimise.fit import as_spline
@@ -114,7 +134,6 @@ def _settings(args: argparse.Namespace) -> StudySettings:
     return StudySettings(
         start=start,
         searcher=args.searcher,
-        seed=args.seed,
         step=args.step,
         population=args.population,
         fixed=tuple(args.fix),
@@ -123,10 +142,7 @@ def _settings(args: argparse.Namespace) -> StudySettings:
         model=model,
         mu_s=options.mean_of(args),
         sigma_s=options.spread("--sigma", args.sigma),
-        slope_limit_deg=args.slope_limit,
-        stages=stages,
-        check_walks=args.check_walks or 1,
-        **given,
+        **_scoring(args),
     )
 
 

@@ -252,6 +252,7 @@ examples:
   biped-mfpt optimise --controller hzd/robust --as-spline --sigma 5 --slope-limit 45
   biped-mfpt optimise --controller hzd/base --objective mfpt cot=20 --searcher nsga2 \\
       --limit speed_min=0.6 clearance_min=0.02 --trials 2000 --study front
+  biped-mfpt optimise --confirm front --mesh 0.25:0.03:inf:2000000 --seed 2
 """,
         "walker",
         "output",
@@ -261,6 +262,14 @@ examples:
     )
     optimise.add_argument(
         "--store", default=_STORE, metavar="FILE", help="of the trials (default: %(default)s)"
+    )
+    optimise.add_argument(
+        "--confirm",
+        metavar="STUDY",
+        help="no search: score the front of another study of the store again, that is, its "
+        "confirmed trials that no other one beats in MFPT and cost of transport. --mesh, "
+        "--slope-limit, --check-walks, --trial-seconds, --tolerance and --seed are as given, all "
+        "else is as in STUDY",
     )
     optimise.add_argument(
         "--searcher",
@@ -351,6 +360,13 @@ examples:
     )
     optimise.add_argument(
         "--seconds", type=_number, metavar="S", help="s, begin no trial after that"
+    )
+    optimise.add_argument(
+        "--trial-seconds",
+        type=_number,
+        default=600.0,
+        metavar="S",
+        help="s, after which a trial is given up (default: %(default)g)",
     )
     optimise.add_argument(
         "--seed", type=_whole, default=1, metavar="N", help="of the search (default: 1)"

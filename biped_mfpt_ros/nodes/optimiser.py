@@ -31,6 +31,7 @@ from biped_mfpt_ros.nodes.messages import (
     model_message,
     packed,
     unpacked,
+    unpacked_rows,
 )
 from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters, parameter
 from biped_mfpt_ros.nodes.pipeline_backend import PipelineBackend
@@ -40,6 +41,7 @@ from biped_mfpt_ros.nodes.spin import run_node
 from biped_mfpt_ros.nodes.warm_up import compiled
 from biped_mfpt_ros.optimise.scoring import BackendLost
 from biped_mfpt_ros.optimise.settings import Stage, StudySettings
+from biped_mfpt_ros.optimise.space import SearchSpace
 from biped_mfpt_ros.optimise.store import Store, Trial
 from biped_mfpt_ros.optimise.study import Study, best_trial
 
@@ -246,13 +248,18 @@ def settings_from(request: Optimise.Goal) -> StudySettings:
     for name in ("step", "check_steps", "check_walks", "trial_seconds", "searcher"):
         if getattr(request, name):
             given[name] = getattr(request, name)
+    start, model = controller_from(request.start, "start"), model_from(request.model)
+    if request.candidates:
+        n = len(SearchSpace(start, model.robot, request.fixed))
+        rows = unpacked_rows(request.candidates, "d", n, "candidates")
+        given["candidates"] = tuple(map(tuple, rows.tolist()))
     return StudySettings(
-        start=controller_from(request.start, "start"),
+        start=start,
         seed=request.seed,
         population=request.population,
         fixed=tuple(request.fixed),
         limits=_named(request.limits, request.limit_values, "limit_values"),
-        model=model_from(request.model),
+        model=model,
         mu_s=request.mu_s,
         sigma_s=request.sigma_s,
         slope_limit_deg=degrees_of(request.slope_limit),
@@ -272,6 +279,7 @@ def goal_message(study: str, settings: StudySettings) -> Optimise.Goal:
         step=float(settings.step),
         population=settings.population,
         fixed=list(settings.fixed),
+        candidates=packed(np.array(settings.candidates), "d"),
         objectives=list(settings.objectives),
         weights=packed(np.array(list(settings.objectives.values())), "d"),
         limits=list(settings.limits),

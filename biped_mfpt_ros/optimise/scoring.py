@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -375,22 +375,22 @@ def _check_by_walks(
         return
 
 
-def _utilities(settings: StudySettings, values: dict[str, float]) -> tuple[float, ...]:
-    """What is to be maximised, for each objective."""
+def utilities(names: Iterable[str], values: dict[str, float]) -> tuple[float, ...]:
+    """What is to be maximised, for each of the objectives named."""
     known = {
         "mfpt": lambda v: min(MOST_DECADES, math.log10(max(v, 1.0))),
         "cot": lambda v: -v,
         "speed": lambda v: v,
     }
-    return tuple(float(known[name](values[name])) for name in settings.objectives)
+    return tuple(float(known[name](values[name])) for name in names)
 
 
 def _weigh(settings: StudySettings, out: Evaluation) -> None:
-    utilities = _utilities(settings, out.values)
+    wanted = utilities(settings.objectives, out.values)
     weights = settings.objectives.values()
-    score = sum(w * u for w, u in zip(weights, utilities, strict=True))
+    score = sum(w * u for w, u in zip(weights, wanted, strict=True))
     out.score = min(-_LEAST, max(_LEAST, score))
-    out.costs = tuple(-u for u in utilities)
+    out.costs = tuple(-u for u in wanted)
     out.violation = 0.0
 
 

@@ -2,7 +2,7 @@
 
 A searcher is a deterministic function of its settings, its seed and what it was told: told the
 same history, another process asks for the same candidates, bit for bit. A generation is asked for
-as a whole and told as a whole. The first one is the start alone.
+as a whole and told as a whole. The first one is the start alone, but for `Given`.
 
 Scores are to be maximised. Only their order matters, but for `Nsga2`, which sees objectives and
 violations instead.
@@ -13,6 +13,7 @@ from __future__ import annotations
 import queue
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,6 +56,8 @@ class Searcher(ABC):
         Candidates in a generation, if the method has a choice; 0: its default.
     objectives : int
         How many costs are told.
+    candidates : sequence of sequence of float
+        What `Given` has tried, shape (k, n).
     """
 
     done = False
@@ -67,18 +70,20 @@ class Searcher(ABC):
         step: float = 1.0,
         population: int = 0,
         objectives: int = 1,
+        candidates: Sequence[Sequence[float]] = (),
     ) -> None:
         self.bounds = np.asarray(bounds, dtype=np.float64)
         self.n = len(self.bounds)
         self.seed, self.step, self.population = seed, step, population
         self.objectives = objectives
+        self.candidates = candidates
         self._started = False
         self._asked_for: np.ndarray | None = None
 
     def ask(self) -> np.ndarray:
         """The next generation, shape (k, n); the same until it is told."""
         if self._asked_for is None:
-            self._asked_for = self._ask() if self._started else np.zeros((1, self.n))
+            self._asked_for = self._ask() if self._started else self._first()
         return self._asked_for
 
     def tell(self, vectors: np.ndarray, told: list[Told]) -> None:
@@ -92,6 +97,9 @@ class Searcher(ABC):
 
     def close(self) -> None:  # noqa: B027 - most searchers have nothing to end
         """End what runs in the background."""
+
+    def _first(self) -> np.ndarray:
+        return np.zeros((1, self.n))
 
     @abstractmethod
     def _begin(self, start: Told) -> None: ...
@@ -282,11 +290,36 @@ class Nsga2(Searcher):
         self._algorithm.tell(infills=self._population)
 
 
+class Given(Searcher):
+    """No search: the candidates of another study, all in one generation, and nothing after it."""
+
+    def __init__(self, bounds: np.ndarray, **settings: Any) -> None:
+        super().__init__(bounds, **settings)
+        vectors = [np.asarray(v, dtype=np.float64) for v in self.candidates]
+        for i, vector in enumerate(vectors):
+            if vector.shape != (self.n,) or not np.isfinite(vector).all():
+                raise InputError(f"candidates[{i}]", vector.tolist(), f"{self.n} finite numbers")
+        self._vectors = np.array(vectors)
+
+    def _first(self) -> np.ndarray:
+        return self._vectors
+
+    def _begin(self, start: Told) -> None:
+        self.done = True
+
+    def _ask(self) -> np.ndarray:
+        raise AssertionError("it is done")
+
+    def _tell(self, vectors: np.ndarray, told: list[Told]) -> None:
+        raise AssertionError("it is done")
+
+
 SEARCHERS: dict[str, type[Searcher]] = {
     "cma-es": CmaEs,
     "nelder-mead": NelderMead,
     "pattern": PatternSearch,
     "nsga2": Nsga2,
+    "given": Given,
 }
 """Every searcher by its name."""
 

@@ -84,6 +84,8 @@ class StudySettings:
         Candidates in a generation; 0: the searcher's own.
     fixed : tuple of str
         Patterns of coordinates that are not searched.
+    candidates : tuple of tuple of float
+        All that ``given`` has tried, in the scaled coordinates of the space; for it alone.
     objectives : dict
         Names of `OBJECTIVES` with their weights in the score, > 0.
     limits : dict
@@ -120,6 +122,7 @@ class StudySettings:
     step: float = 1.0
     population: int = 0
     fixed: tuple[str, ...] = ()
+    candidates: tuple[tuple[float, ...], ...] = ()
     objectives: dict[str, float] = field(default_factory=lambda: {"mfpt": 1.0})
     limits: dict[str, float] = field(default_factory=dict)
     model: WalkerModel = field(default_factory=WalkerModel)
@@ -150,6 +153,9 @@ class StudySettings:
         several = len(self.objectives) > 1
         _check("searcher", self.searcher, self.searcher != "nsga2" or several,
                "another one, or several objectives")  # fmt: skip
+        given = self.searcher == "given"
+        _check("candidates", self.candidates, bool(self.candidates) == given,
+               "at least one for the searcher given, none for others")  # fmt: skip
         _check("sigma_s", self.sigma_s, 0.0 < self.sigma_s < math.inf, "> 0 rad")
         _check("stages", self.stages, bool(self.stages), "at least one mesh")
         for stage in self.stages:
@@ -176,6 +182,8 @@ class StudySettings:
         out["start"] = start | {"parameters": self.start.parameters.tolist()}
         out["model"] = {name: _text(getattr(self.model, name)) for name in MODEL_FIELDS}
         out["stages"] = [{k: _text(v) for k, v in asdict(s).items()} for s in self.stages]
+        if not self.candidates:  # a study that was begun before there were any goes on
+            del out["candidates"]
         return {k: list(v) if isinstance(v, tuple) else v for k, v in out.items()}
 
     @classmethod
@@ -190,6 +198,7 @@ class StudySettings:
             Stage(float(s["slope_step_deg"]), float(s["threshold"]), float(s["margin"]),
                   int(s["max_states"])) for s in data["stages"]
         )  # fmt: skip
+        given["candidates"] = tuple(tuple(vector) for vector in data.get("candidates", ()))
         for name in ("fixed", "check_sigmas"):
             given[name] = tuple(data[name])
         return cls(**given)

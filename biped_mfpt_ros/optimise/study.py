@@ -14,8 +14,10 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 from biped_mfpt_ros.control.controller import Controller
+from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import STEP_MAP
 from biped_mfpt_ros.optimise.scoring import (
     Backend,
@@ -25,6 +27,7 @@ from biped_mfpt_ros.optimise.scoring import (
     Stopped,
     evaluate,
     front_of,
+    utilities,
 )
 from biped_mfpt_ros.optimise.searchers import Told, make_searcher
 from biped_mfpt_ros.optimise.settings import StudySettings
@@ -66,16 +69,10 @@ class Study:
         owner: str | None = None,
     ) -> None:
         self.store, self.name = store, name
-        if settings is None:
-            self._id, self.settings = store.open(name)
-            self.space = SearchSpace(
-                self.settings.start, self.settings.model.robot, self.settings.fixed
-            )
-        else:
-            # What is wrong with the settings is found before anything is written.
-            self.settings = settings
-            self.space = SearchSpace(settings.start, settings.model.robot, settings.fixed)
-            self._id = store.create(name, settings)
+        self.settings = settings or store.open(name)[1]
+        self.space = SearchSpace(
+            self.settings.start, self.settings.model.robot, self.settings.fixed
+        )
         self.owner = owner or this_owner()
         self._searcher = make_searcher(
             self.settings.searcher,
@@ -84,7 +81,10 @@ class Study:
             step=self.settings.step,
             population=self.settings.population,
             objectives=len(self.settings.objectives),
+            candidates=self.settings.candidates,
         )
+        # What is wrong with the settings has been found before anything is written.
+        self._id = store.open(name)[0] if settings is None else store.create(name, settings)
         self._lock = threading.Condition()
         self._told = 0  # generations
         self._first = 0  # number of the first trial of the generation that is open
@@ -273,6 +273,37 @@ def best_trial(trials: list[Trial]) -> Trial | None:
         if best is None or best.found is None or trial.found.score > best.found.score:
             best = trial
     return best
+
+
+def confirming(study: Study, **changed: Any) -> StudySettings:
+    """Settings of a study that tries the front of another one again, most steps first.
+
+    The front: confirmed trials that no other one beats, or equals, in MFPT, cost of transport and
+    every other objective.
+
+    Parameters
+    ----------
+    study : Study
+        Whose front, start and space; the rest of its settings too, but for what is changed.
+    **changed
+        Fields of `StudySettings`, such as finer ``stages``.
+
+    Raises
+    ------
+    InputError
+        If nothing is confirmed by a mesh.
+    """
+    names = dict.fromkeys(("mfpt", "cot", *study.settings.objectives))
+    found: dict[tuple[float, ...], tuple[float, ...]] = {}
+    for trial in study.trials():
+        if trial.found is not None and trial.found.confirmed and "mfpt" in trial.found.values:
+            costs = tuple(-u for u in utilities(names, trial.found.values))
+            found.setdefault(costs, tuple(trial.vector.tolist()))
+    if not found:
+        raise InputError("study", study.name, "one with a trial that a mesh has confirmed")
+    ordered = sorted(found)
+    candidates = tuple(found[ordered[i]] for i in front_of(ordered))
+    return replace(study.settings, searcher="given", candidates=candidates, **changed)
 
 
 def improved(best: Best, found: list[Evaluation]) -> Best:
