@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from biped_mfpt_ros.control.controller import catalogue
 from biped_mfpt_ros.gait.cycle import NoLimitCycle, find_limit_cycle
@@ -19,6 +21,9 @@ from biped_mfpt_ros.study.readings import readings
 
 _COLOURS = (OURS, "#e08e1b", "#2a8c5a", "#8a4fae", "#333a45")
 _GREY = "#a9adb3"
+_TITLES = {"hzd": "hybrid zero dynamics", "smc": "sliding mode", "spline": "B-spline references"}
+_NEAR = 1e10  # steps
+_BEHIND = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
 
 
 def history(study: Study) -> Picture:
@@ -73,9 +78,10 @@ def _points(trials: Sequence[Trial]) -> tuple[list[int], list[float]]:
 def front(studies: Sequence[Study], paper: bool = True) -> Picture:
     """Cost of transport against MFPT: the confirmed trials of studies that no other beats in both.
 
-    Studies of the same scheme are taken together. The paper's controllers are those of the
-    catalogue, each under the limits of ``data/readings.json`` and on the last mesh of the first
-    study, at its sigma_s.
+    Studies of the same scheme are taken together. Points are filled where Monte Carlo has agreed,
+    and hollow where falls are too rare for it even at the largest sigma_s that the slope set
+    allows. The paper's controllers are those of the catalogue, each under the limits of
+    ``data/readings.json`` and on the last mesh of the first study, at its sigma_s.
 
     Parameters
     ----------
@@ -92,41 +98,87 @@ def front(studies: Sequence[Study], paper: bool = True) -> Picture:
     settings = studies[0].settings
     if len({(s.settings.mu_s, s.settings.sigma_s) for s in studies}) > 1:
         raise ValueError("studies of different slope distributions do not make one front")
-    figure = new_figure(4.2)
-    axes = figure.add_subplot()
-    texts = []
-    schemes = dict.fromkeys(s.settings.start.scheme for s in studies)
-    for colour, scheme in zip(_COLOURS, schemes, strict=False):
-        points = [
-            (-t.found.values["mfpt"], t.found.values["cot"])
-            for s in studies
-            if s.settings.start.scheme == scheme
-            for t in s.trials()
-            if t.found is not None and t.found.confirmed and "mfpt" in t.found.values
-        ]
-        best = sorted(points[i] for i in front_of(points))
-        mfpt, cot = [-p[0] for p in best], [p[1] for p in best]
-        axes.plot([-p[0] for p in points], [p[1] for p in points], ".", color=colour,
-                  markersize=3, alpha=0.35)  # fmt: skip
-        axes.plot(mfpt, cot, "o-", color=colour, markersize=4, label=scheme)
-        texts.append(f"{scheme}: {len(best)} on the front of {len(points)} confirmed")
-    if paper:
-        for name, (mfpt_, cot_) in paper_points(settings).items():
-            axes.plot([mfpt_], [cot_], "*", color=PAPER, markersize=11, markeredgecolor="white")
-            axes.annotate(name, (mfpt_, cot_), (4, 4), textcoords="offset points", fontsize=8)
-    axes.set_xscale("log")
+    confirmed: dict[str, list[dict[str, float]]] = {}
+    for study in studies:
+        rows = confirmed.setdefault(study.settings.start.scheme, [])
+        for trial in study.trials():
+            # Without an end on its slopes, a walk has no place on the axis.
+            if (
+                trial.found is not None
+                and trial.found.confirmed
+                and math.isfinite(trial.found.values.get("mfpt", math.nan))
+            ):
+                rows.append(trial.found.values)
+    fronts = {scheme: _front(rows) for scheme, rows in confirmed.items()}
+    stars = paper_points(settings) if paper else {}
+    longest = max((v["mfpt"] for rows in fronts.values() for v in rows), default=1.0)
+    # A panel of their own for the few decades in which the paper's are, if there are many more.
+    near = longest > _NEAR**1.5
+    figure = new_figure(7.0 if near else 4.2)
+    panels = list(figure.subplots(2 if near else 1, squeeze=False)[:, 0])
+    for axes in panels:
+        for colour, (scheme, rows) in zip(_COLOURS, fronts.items(), strict=False):
+            _draw_front(axes, scheme, colour, confirmed[scheme], rows)
+        axes.set_xscale("log")
+        axes.set_ylabel("cost of transport")
+        tidy(axes)
+    if near:
+        panels[0].set_xlim(1.0, _NEAR)
+    for name, point in stars.items():
+        for axes in panels:
+            axes.plot(*point, "*", color=PAPER, markersize=12, markeredgecolor="white", zorder=7)
+        # In the panel where they are apart, and below where another star is above to the right.
+        crowded = any(0.0 < cot - point[1] < 0.1 and 1.0 < mfpt / point[0] < 10.0
+                      for mfpt, cot in stars.values())  # fmt: skip
+        panels[0].annotate(name, point, (0, -14 if crowded else 8), textcoords="offset points",
+                           fontsize=8, color=PAPER, zorder=6, bbox=_BEHIND)  # fmt: skip
+    for axes in panels:
+        axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])
     sigma = math.degrees(settings.sigma_s)
-    axes.set_xlabel(f"MFPT at σ = {sigma:g}°, steps")
-    axes.set_ylabel("cost of transport")
-    axes.set_ylim(bottom=0.0)
-    axes.legend(frameon=False)
-    tidy(axes)
+    panels[-1].set_xlabel(f"MFPT at σ = {sigma:g}°, steps")
+    handles = [Line2D([], [], color=colour, marker="o", markersize=4, label=_TITLES[scheme])
+               for colour, scheme in zip(_COLOURS, fronts, strict=False)]  # fmt: skip
+    handles.append(Line2D([], [], color=_GREY, marker="o", linestyle="", markersize=4,
+                          markerfacecolor="white", label="too rare a fall for walks"))  # fmt: skip
+    if stars:
+        handles.append(Line2D([], [], color=PAPER, marker="*", linestyle="", markersize=10,
+                              label="the paper's six"))  # fmt: skip
+    figure.legend(handles=handles, frameon=False, loc="outside upper center", ncols=2, fontsize=9)
+    texts = [
+        f"{scheme}: {len(rows)} on the front of {len(confirmed[scheme])} confirmed, "
+        f"{sum('check_steps' in v for v in rows)} of these checked by walks"
+        for scheme, rows in fronts.items()
+    ]
     caption = (
         f"Cost of transport on flat ground against MFPT at sigma_s = {sigma:g} degrees. "
         + "; ".join(texts)
-        + (". Stars: the paper's controllers." if paper else ".")
+        + (". Stars: the paper's controllers." if stars else ".")
     )
     return Picture("Cost of transport against MFPT", caption, png(figure))
+
+
+def _front(rows: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+    """Those that no other one beats in both, most steps first."""
+    costs = [(-v["mfpt"], v["cot"]) for v in rows]
+    return [rows[i] for i in sorted(front_of(costs), key=lambda i: costs[i])]
+
+
+def _draw_front(
+    axes: Axes,
+    scheme: str,
+    colour: str,
+    confirmed: Sequence[dict[str, float]],
+    front: Sequence[dict[str, float]],
+) -> None:
+    axes.plot([v["mfpt"] for v in confirmed], [v["cot"] for v in confirmed], ".", color=colour,
+              markersize=3, alpha=0.35)  # fmt: skip
+    # What has at least so many steps costs as much as the next one on the front: a staircase.
+    axes.plot([v["mfpt"] for v in front], [v["cot"] for v in front], drawstyle="steps-post",
+              color=colour, linewidth=1.2)  # fmt: skip
+    for checked in (True, False):
+        some = [v for v in front if ("check_steps" in v) is checked]
+        axes.plot([v["mfpt"] for v in some], [v["cot"] for v in some], "o", color=colour,
+                  markersize=4, markerfacecolor=colour if checked else "white")  # fmt: skip
 
 
 def paper_points(settings: StudySettings) -> dict[str, tuple[float, float]]:
