@@ -21,6 +21,7 @@ from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.space import SearchSpace
 from biped_mfpt_ros.optimise.store import Store
 from biped_mfpt_ros.optimise.study import Study, confirming
+from biped_mfpt_ros.report.studies import front
 from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 
 # Spaces ------------------------------------------------------------------------------------------
@@ -338,6 +339,20 @@ def test_the_front_of_a_study_is_tried_again(scored, searched_study):
         assert study.controller(new).parameters.tobytes() == same.tobytes()
     assert study.run(None, 1) == "converged"
     assert len(scored.calls) == 3
+
+
+def test_the_picture_of_a_front_is_of_what_is_confirmed(searched_study):
+    store, study = searched_study.store, searched_study
+    store.propose(study._id, 1, len(FOUND), np.ones((2, len(study.space))))
+    checked = confirmed(0.3, 500.0)  # beaten
+    checked.values["check_steps"] = 9.0
+    # Without an end it has no place on the axis, whatever it costs.
+    for number, found in enumerate((checked, confirmed(0.01, math.inf)), len(FOUND)):
+        store.claim(study._id, "me:1:0", 99)
+        store.finish(study._id, number, "me:1:0", found, "")
+    picture = front([study], paper=False)
+    assert "smc: 3 on the front of 6 confirmed, 0 of these checked by walks" in picture.caption
+    assert picture.data.startswith(b"\x89PNG")
 
 
 def test_every_objective_counts_for_the_front(tmp_path):

@@ -133,13 +133,15 @@ def front(studies: Sequence[Study], paper: bool = True) -> Picture:
         panels[0].annotate(name, point, (0, -14 if crowded else 8), textcoords="offset points",
                            fontsize=8, color=PAPER, zorder=6, bbox=_BEHIND)  # fmt: skip
     for axes in panels:
-        axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])
+        top = 1.08 * axes.get_ylim()[1]
+        axes.set_ylim(-0.06 * top, top)  # with room for a label below
     sigma = math.degrees(settings.sigma_s)
     panels[-1].set_xlabel(f"MFPT at σ = {sigma:g}°, steps")
     handles = [Line2D([], [], color=colour, marker="o", markersize=4, label=_TITLES[scheme])
                for colour, scheme in zip(_COLOURS, fronts, strict=False)]  # fmt: skip
-    handles.append(Line2D([], [], color=_GREY, marker="o", linestyle="", markersize=4,
-                          markerfacecolor="white", label="too rare a fall for walks"))  # fmt: skip
+    if any("check_steps" not in v for rows in fronts.values() for v in rows):
+        handles.append(Line2D([], [], color=_GREY, marker="o", linestyle="", markersize=4,
+                              markerfacecolor="white", label="too rare for walks"))  # fmt: skip
     if stars:
         handles.append(Line2D([], [], color=PAPER, marker="*", linestyle="", markersize=10,
                               label="the paper's six"))  # fmt: skip
