@@ -31,7 +31,7 @@ class Counting(Simulator):
     def _simulate(self, request, response):
         self.count += len(request.previous_slopes)
         self.largest = max(self.largest, len(request.previous_slopes))
-        time.sleep(0.02)
+        time.sleep(0.1)  # so that a mesh outlasts what is slow to end its mesher
         return super()._simulate(request, response)
 
 
