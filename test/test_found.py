@@ -98,7 +98,7 @@ def test_mesh_and_walks_as_confirmed(name):
     slopes = slope_set(wanted["slope_step_deg"], wanted["slope_limit_deg"])
     mesh = grow_mesh(
         lambda states, previous: simulate_steps(control, states, previous, slopes),
-        cycle.state, slopes, wanted["threshold"],
+        cycle.state, slopes, wanted["threshold"], max_states=2 * wanted["states"],
     )  # fmt: skip
     # The mesh is a function of the step map to the last bit; another one that is as exact (2e-7)
     # moves single states over the threshold.

@@ -40,6 +40,10 @@ START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
 RESULT_TIMEOUT = 120.0  # s, for the analysis to solve the chain
 _MOST_SWINGS = 100_000  # of a Monte Carlo: half a minute or so
 _MOST_MESHERS = 4  # started in a run: where one after the other is killed, there is a reason
+_MATCHED_WITHIN = 2.0
+"""s from when all nodes are there. A publisher may learn later than we do that the recorder hears
+it, tenths of a second on a busy machine; what it published before it sends then, if it still runs:
+a mesh of some states was grown and solved, and the nodes stopped, before that."""
 _CURVE_POINTS = 40
 _PICTURE_STEPS = 6
 
@@ -257,6 +261,7 @@ class Pipeline:
 
         with Client(self.namespace, self.watch) as client:
             client.wait(partial(self.up, client), START_TIMEOUT, "the nodes to come up")
+            all_there = time.monotonic() + _MATCHED_WITHIN
             text = MeshProgress()
 
             def feedback(message: Any) -> None:
@@ -283,6 +288,9 @@ class Pipeline:
             curve = client.compute_mfpt(
                 grown.mesh_id, mean, list(np.linspace(low, high, _CURVE_POINTS))
             )
+            if time.monotonic() < all_there:
+                self._progress.show("giving the recorder time to hear of everything")
+                client.wait(lambda: time.monotonic() >= all_there, RESULT_TIMEOUT, "the recorder")
             return {
                 "mesh_id": grown.mesh_id,
                 "threshold": settings.threshold,
