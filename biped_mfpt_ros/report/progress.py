@@ -145,7 +145,7 @@ class MeshProgress:
         states : int
             States in the mesh.
         frontier : int
-            States of the generation still to be simulated.
+            States known that have not been simulated.
         swings_per_second : float
             1/s; one swing explores one state.
         simulators : int, optional

@@ -44,7 +44,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(json.dumps({"seed": args.seed, "rows": found, "failures": failures}, indent=2))
     else:
         print(_text(rows))
-    sys.stdout.flush()
     code = int(failures > 0)
     leave_graph(code)
     return code

@@ -62,7 +62,6 @@ _CANCEL_AFTER = 0.3
 """s, after which a goal has shown that it is taken."""
 
 _START = 300.0  # s, for nodes that may have to compile
-_END = 10.0  # s, for nodes to end
 
 # What an allowed question may bring to light, which is no fault of who asked.
 _FACTS = re.compile(
