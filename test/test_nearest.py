@@ -107,6 +107,23 @@ def test_large_set_is_that_of_going_through_all(clusters):
     assert found.nearest(queries, own, scales).tolist() == expected
 
 
+def test_the_grid_outlasts_scales_that_change_a_little():
+    # In a plane, where distances are those within the grid: they are less than it was laid out for.
+    rng = np.random.default_rng(1)
+    flat = np.zeros((3000, STATE_SIZE))
+    flat[:, :2] = rng.uniform(-1.0, 1.0, (3000, 2))
+    scales = np.full(STATE_SIZE, np.inf)
+    scales[:2] = 1.0
+    found, reference = StateSet(1, 100_000), Reference()
+    own = np.zeros(1000, dtype=np.uint32)
+    found.extend(flat[:1000], own, scales, 1e-9)
+    reference.extend(flat[:1000], own, scales, 1e-9)
+    for factor in (1.0, 1.2, 0.9, 1.5):
+        changed = scales * factor
+        expected = [reference.nearest(query, 0, changed)[0] for query in flat[1000:]]
+        assert found.nearest(flat[1000:], np.tile(own, 2), changed).tolist() == expected
+
+
 def test_lowest_index_wins_a_tie():
     found = StateSet(1, 100)
     states = np.zeros((4, STATE_SIZE))

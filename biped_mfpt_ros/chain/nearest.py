@@ -8,8 +8,10 @@ ring, until the distance within the grid alone is more than that to the nearest 
 leaves out no state that could be the answer: it is always the one that going through all states
 would give.
 
-The grid is laid out anew when the scales change, as they do from generation to generation, and
-when the number of states has doubled. In between, a new state goes to its cell at once.
+The grid is laid out anew when the number of states has doubled, and when the scales have changed
+much since. In between, a new state goes to its cell at once. Scales that changed little, as they do
+from generation to generation, leave the grid as it is: with w_i = 1 / r_i, a distance is at least
+that of the grid's own scales times the square of the smallest ratio of new to old w_i.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ STATE_SIZE = 10
 _FIRST_CAPACITY = 256
 _WORTH_A_GRID = 32  # states of a cluster; fewer are gone through one by one
 _STATES_PER_CELL = 1.0  # when the grid is laid out; up to twice that before it is again
+_LIKE_ENOUGH = 0.8  # ratio of weights, or of what was, for which a grid is still good
 # Rounding of a place in the grid, relative to the width of the grid and to a distance: with
 # sums of ten terms it is below 1e-14.
 _MARGIN = 1e-12
@@ -267,7 +270,8 @@ class StateSet:
     def _lay_out(self, weights: np.ndarray) -> None:
         """Lay out the grids for these weights, and put all states into their cells."""
         clusters, states, of_cluster = self._clusters, self.states, self._of_cluster
-        self._weights, self._laid_out = weights, self._count
+        self._weights = self._laid_out_for = weights
+        self._laid_out = self._count
         counts = np.bincount(of_cluster[1:], minlength=clusters)
         self._grids = np.zeros((clusters, _GRID_SIZE))
         self._grids[:, _WIDTH] = 1.0
@@ -276,6 +280,7 @@ class StateSet:
         if len(large):
             with np.errstate(all="ignore"):
                 self._lay_out_grids(large, counts)
+        self._widths = self._grids[:, _WIDTH].copy()
         self._first_cells = np.concatenate([[0], np.cumsum(self._columns.prod(axis=1))])
         self._heads = np.zeros(self._first_cells[-1], dtype=np.uint32)
         _insert_all(states, of_cluster, *self._index())
@@ -306,6 +311,19 @@ class StateSet:
         grids[large, _WIDTH:] = width
         self._grids[large] = grids[large]
         self._columns[large] += (extent / width).astype(np.int64)
+
+    def _set_weights(self, weights: np.ndarray) -> None:
+        """Have the grids be good for these weights, laid out anew if need be."""
+        if np.array_equal(weights, self._weights):
+            return
+        old = self._laid_out_for
+        with np.errstate(all="ignore"):
+            ratios = np.where(weights == old, 1.0, weights / old)
+        if ratios.min() >= _LIKE_ENOUGH and ratios.max() <= 1.0 / _LIKE_ENOUGH:
+            self._weights = weights
+            self._grids[:, _WIDTH] = ratios.min() * self._widths
+        else:
+            self._lay_out(weights)
 
     def _index(self) -> tuple[np.ndarray, ...]:
         return self._grids, self._columns, self._first_cells, self._heads, self._earlier
@@ -349,12 +367,13 @@ class StateSet:
             False if the limit was reached and a further candidate had to be added.
         """
         weights = 1.0 / scales
+        self._set_weights(weights)
         pieces = []
         position = 0
         while True:
             # Whatever the grid, the answer is the same: it is the search that gets longer.
             room = 2 * self._laid_out + 64 - self._count
-            if room <= 0 or not np.array_equal(weights, self._weights):
+            if room <= 0:
                 self._lay_out(weights)
                 continue
             room = min(room, _FIRST_CAPACITY + self._count // 8)
@@ -386,8 +405,7 @@ class StateSet:
             uint32, shape (k,); 0 where the cluster has no state.
         """
         weights = 1.0 / scales
-        if not np.array_equal(weights, self._weights):
-            self._lay_out(weights)
+        self._set_weights(weights)
         out = np.empty(len(candidates), dtype=np.uint32)
         _nearest(candidates, clusters, weights, self._states, *self._index(), out)
         return out
