@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from biped_mfpt_ros.chain.nearest import STATE_SIZE, StateSet
 from biped_mfpt_ros.chain.refresh import additions
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.terrain import check_slopes
 
@@ -312,19 +313,39 @@ def _slope_index(slopes: np.ndarray, slope: float, field: str) -> int:
     return nearest
 
 
+@kernel
+def _moments(states, deviation, largest):
+    """Standard deviation, and largest magnitude, of each dimension."""
+    n, size = states.shape
+    mean = np.zeros(size)
+    largest[:] = 0.0
+    deviation[:] = 0.0
+    # Taken from the first state, a constant dimension is exactly 0 and a narrow one loses nothing.
+    for i in range(n):
+        for d in range(size):
+            mean[d] += states[i, d] - states[0, d]
+            largest[d] = max(largest[d], abs(states[i, d]))
+    for d in range(size):
+        mean[d] /= n
+    for i in range(n):
+        for d in range(size):
+            difference = states[i, d] - states[0, d] - mean[d]
+            deviation[d] += difference * difference
+    for d in range(size):
+        deviation[d] = np.sqrt(deviation[d] / n)
+
+
 def _spread(states: np.ndarray) -> np.ndarray:
     """Standard deviation of each dimension, exactly 0 where it is rounding only; shape (10,)."""
     if len(states) == 0:
         return np.zeros(STATE_SIZE)
-    # Taken from the first state, a constant dimension is exactly 0 and a narrow one loses nothing.
-    deviation = np.std(states - states[0], axis=0)
-    largest = np.maximum(states.max(axis=0), -states.min(axis=0))
+    deviation, largest = np.empty((2, STATE_SIZE))
+    _moments(states, deviation, largest)
     return np.where(deviation > _ROUNDING * np.maximum(largest, 1.0), deviation, 0.0)
 
 
-def _scales(states: np.ndarray, successors: np.ndarray) -> np.ndarray:
+def _scales(spread: np.ndarray, successors: np.ndarray) -> np.ndarray:
     """Scales r_i of eq. (25) by the rules at the top of this file; shape (10,)."""
-    spread = _spread(states)
     if not spread.all():
         spread = np.where(spread > 0.0, spread, _spread(successors))
     return np.where(spread > 0.0, spread, np.inf)
@@ -499,13 +520,13 @@ class MeshGrowth:
 
     def _refresh(self, end: int) -> bool:
         """Refresh the scales at the start of a generation; False if answers are missing for it."""
-        states = self._found.states[1:end]
+        spread = _spread(self._found.states[1:end])
         reached = np.empty((0, STATE_SIZE))
-        if self._each_addition or not _spread(states).all():
+        if self._each_addition or not spread.all():
             if self._answered < end - 1:
                 return False
             reached = np.concatenate([piece[1] for piece in self._pieces(self._tested, end)])
-        self._scales = _scales(states, reached)
+        self._scales = _scales(spread, reached)
         return True
 
     def _pieces(self, start: int, stop: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
