@@ -18,14 +18,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from biped_mfpt_ros.jit import kernel
+from biped_mfpt_ros.jit import inner_kernel, kernel
 
 STATE_SIZE = 10
 """Length of a state: q1..q5 (rad), dq1..dq5 (rad/s)."""
 
 _FIRST_CAPACITY = 256
 _WORTH_A_GRID = 32  # states of a cluster; fewer are gone through one by one
-_STATES_PER_CELL = 1.0  # when the grid is laid out; up to twice that before it is again
+_STATES_PER_CELL = 0.5  # of the whole grid when it is laid out, and up to twice that later
 _LIKE_ENOUGH = 0.8  # ratio of weights, or of what was, for which a grid is still good
 # Rounding of a place in the grid, relative to the width of the grid and to a distance: with
 # sums of ten terms it is below 1e-14.
@@ -40,7 +40,7 @@ _WIDTH = _LOW + 2  # width of a cell, in the unit of the distance
 _GRID_SIZE = _WIDTH + 1
 
 
-@kernel
+@inner_kernel
 def _distance(candidates, position, states, index, weights):
     """Eq. (25) between two rows. Ending the sum early would cost more in branches than it saves."""
     distance = 0.0
@@ -50,7 +50,7 @@ def _distance(candidates, position, states, index, weights):
     return distance
 
 
-@kernel
+@inner_kernel
 def _place(rows, position, grid, columns):
     """Place of a state in a grid, in cells; moved to the edge if outside. NaN if it has none."""
     u = -grid[_LOW]
@@ -64,13 +64,13 @@ def _place(rows, position, grid, columns):
     return min(max(u, 0.0), float(columns[0])), min(max(v, 0.0), float(columns[1]))
 
 
-@kernel
+@inner_kernel
 def _cell(place, columns):
     """Index of the cell of a place along one direction."""
     return min(np.int64(place), columns - 1)
 
 
-@kernel
+@inner_kernel
 def _insert(states, index, cluster, grids, columns, first_cells, heads, earlier):
     """Put a state into the chain of its cell, which goes from high indices to low ones."""
     u, v = _place(states, index, grids[cluster], columns[cluster])
@@ -83,7 +83,7 @@ def _insert(states, index, cluster, grids, columns, first_cells, heads, earlier)
     heads[cell] = index
 
 
-@kernel
+@inner_kernel
 def _nearest_within(
     candidates, position, cluster, weights, limit, any_will_do,
     states, grids, columns, first_cells, heads, earlier,
@@ -151,7 +151,7 @@ def _nearest_within(
         ring += 1
 
 
-@kernel
+@inner_kernel
 def _extend(
     candidates, clusters, weights, threshold, start, states, of_cluster, count, added,
     grids, columns, first_cells, heads, earlier,
@@ -180,7 +180,7 @@ def _extend(
     return candidates.shape[0], n
 
 
-@kernel
+@inner_kernel
 def _nearest(
     candidates, clusters, weights, states, grids, columns, first_cells, heads, earlier, out
 ):
@@ -210,7 +210,7 @@ def _moments(states, of_cluster, weights, counts, centres, products):
                 products[cluster, d, e] += difference[d] * difference[e]
 
 
-@kernel
+@inner_kernel
 def _extents(states, of_cluster, grids, low, high):
     """Smallest and largest place of each cluster's states along both directions of its grid."""
     for index in range(1, states.shape[0]):
@@ -228,7 +228,7 @@ def _extents(states, of_cluster, grids, low, high):
         high[cluster, 1] = max(high[cluster, 1], v)
 
 
-@kernel
+@inner_kernel
 def _insert_all(states, of_cluster, grids, columns, first_cells, heads, earlier):
     for index in range(1, states.shape[0]):
         _insert(states, index, of_cluster[index], grids, columns, first_cells, heads, earlier)
