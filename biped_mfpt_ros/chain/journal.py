@@ -106,7 +106,8 @@ class Journal:
         body = [
             np.ascontiguousarray(a).reshape(-1).view(np.uint8).data for a in (outcomes, successors)
         ]
-        head = _RECORD.pack(_RECORD_MAGIC, start, n, k, _checksum(head, *body))
+        if self._path is not None:  # else nobody will open it again
+            head = _RECORD.pack(_RECORD_MAGIC, start, n, k, _checksum(head, *body))
         self._write(head, *body)
         self._places[start] = place, n, k
 

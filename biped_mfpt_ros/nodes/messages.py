@@ -33,7 +33,8 @@ if TYPE_CHECKING:  # a simulator needs no chain, and importing it takes a fifth 
 MESSAGE_BYTES = 1_000_000
 """Size at which published arrays are split: larger messages cost more time a byte."""
 
-_LAST_OUTCOME = max(Outcome)
+# Plain numbers: with members of an enumeration NumPy compares in 64 bits, ten times slower.
+_STEP, _LAST_OUTCOME = int(Outcome.STEP), int(max(Outcome))
 
 
 def packed(values: np.ndarray, code: str) -> array[Any]:
@@ -310,7 +311,7 @@ def steps_from(response: SimulateSteps.Response, n: int, m: int) -> Steps:
         raise InputError("outcomes", f"length {outcomes.size}", f"{n} x {m}")
     if outcomes.size and outcomes.max() > _LAST_OUTCOME:
         raise InputError("outcomes", int(outcomes.max()), f"codes 0 to {_LAST_OUTCOME}")
-    steps = int(np.count_nonzero(outcomes == Outcome.STEP))
+    steps = int(np.count_nonzero(outcomes == _STEP))
     following = unpacked(response.next_states, "d")
     if following.size != steps * STATE_SIZE:
         raise InputError(
