@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.gait.closed_loop import (
+    angles,
     beyond,
     margin,
     mode_of_all,
@@ -290,13 +291,53 @@ _WEIGHT = np.array([weight for stage in _STAGES for _, weight in stage])
 
 
 @inner_kernel
+def _scaled(w, row, weight):
+    """Ten columns of a row, times a weight: angles and rates."""
+    x, y = angles(w, row), rates(w, row)
+    return (
+        (weight * x[0], weight * x[1], weight * x[2], weight * x[3], weight * x[4]),
+        (weight * y[0], weight * y[1], weight * y[2], weight * y[3], weight * y[4]),
+    )
+
+
+@inner_kernel
+def _plus(w, row, weight, a, b):
+    """The same, added to ``a`` and ``b``."""
+    x, y = angles(w, row), rates(w, row)
+    return (
+        (
+            a[0] + weight * x[0],
+            a[1] + weight * x[1],
+            a[2] + weight * x[2],
+            a[3] + weight * x[3],
+            a[4] + weight * x[4],
+        ),
+        (
+            b[0] + weight * y[0],
+            b[1] + weight * y[1],
+            b[2] + weight * y[2],
+            b[3] + weight * y[3],
+            b[4] + weight * y[4],
+        ),
+    )
+
+
+@inner_kernel
 def _stage(scheme, rob, par, w, h, stage, into, columns, mode):
     """One stage, in all lanes: its state into a row, its derivative into one of its own."""
-    for i in range(columns):
-        total = _WEIGHT[_START[stage]] * load(w, STAGE + _FROM[_START[stage]], i)
-        for n in range(_START[stage] + 1, _START[stage + 1]):
-            total = total + _WEIGHT[n] * load(w, STAGE + _FROM[n], i)
-        store(w, into, i, load(w, Y, i) + h * total)
+    n = _START[stage]
+    a, b = _scaled(w, STAGE + _FROM[n], _WEIGHT[n])
+    for n in range(_START[stage] + 1, _START[stage + 1]):
+        a, b = _plus(w, STAGE + _FROM[n], _WEIGHT[n], a, b)
+    for i in range(5):
+        store(w, into, i, load(w, Y, i) + h * a[i])
+        store(w, into, 5 + i, load(w, Y, 5 + i) + h * b[i])
+    if columns > STATES:
+        for i in range(WORK, SIZE):
+            total = _WEIGHT[_START[stage]] * load(w, STAGE + _FROM[_START[stage]], i)
+            for n in range(_START[stage] + 1, _START[stage + 1]):
+                total = total + _WEIGHT[n] * load(w, STAGE + _FROM[n], i)
+            store(w, into, i, load(w, Y, i) + h * total)
     da = rates(w, into)
     dda, wanted, applied, force, s, c = motion(scheme, rob, par, w, into, mode)
     power = powers(applied, da)
@@ -391,11 +432,17 @@ def prepare_dense(scheme, rob, par, w):
     for stage in range(STAGES + 1, STAGES + 1 + DENSE_STAGES):
         _stage(scheme, rob, par, w, h, stage, SPARE, STATES, mode)
     for i in range(SIZE):
-        for power in range(4):
-            total = _DENSE[power, 0] * load(w, STAGE, i)
-            for k in range(5, STAGES + 1 + DENSE_STAGES):
-                total = total + _DENSE[power, k] * load(w, STAGE + k, i)
-            store(w, DENSE + 3 + power, i, h * total)
+        rate = load(w, STAGE, i)
+        t3, t4 = _DENSE[0, 0] * rate, _DENSE[1, 0] * rate
+        t5, t6 = _DENSE[2, 0] * rate, _DENSE[3, 0] * rate
+        for k in range(5, STAGES + 1 + DENSE_STAGES):
+            rate = load(w, STAGE + k, i)
+            t3, t4 = t3 + _DENSE[0, k] * rate, t4 + _DENSE[1, k] * rate
+            t5, t6 = t5 + _DENSE[2, k] * rate, t6 + _DENSE[3, k] * rate
+        store(w, DENSE + 3, i, h * t3)
+        store(w, DENSE + 4, i, h * t4)
+        store(w, DENSE + 5, i, h * t5)
+        store(w, DENSE + 6, i, h * t6)
 
 
 @inner_kernel
