@@ -214,6 +214,22 @@ def load(context, array, row, i):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def load_from(context, array, row, first):  # type: ignore[no-untyped-def]
+    """Lanes ``array[row, first : first + LANES]`` of a contiguous array of two dimensions."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        matrix = context.make_array(sig.args[0])(context, builder, args[0])
+        width = builder.extract_value(matrix.shape, 1)
+        i, k = (context.cast(builder, args[n], sig.args[n], types.intp) for n in (1, 2))
+        place = builder.gep(matrix.data, [builder.add(builder.mul(i, width), k)])
+        value = builder.load(builder.bitcast(place, _VECTOR.as_pointer()))
+        value.align = 8
+        return value
+
+    return _lanes(array, row, first), generate
+
+
+@intrinsic
 def store(context, array, row, i, value):  # type: ignore[no-untyped-def]
     """Put lanes, or one number, into ``array[row, i, :]``."""
 

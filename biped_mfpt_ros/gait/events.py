@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from biped_mfpt_ros.control import smc
 from biped_mfpt_ros.gait.closed_loop import (
     beyond,
@@ -32,7 +34,7 @@ from biped_mfpt_ros.gait.scratch import (
     VALUE,
 )
 from biped_mfpt_ros.jit import inner_kernel
-from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat, store
+from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, load_from, select, splat, store
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.dynamics import foot, sines
 
@@ -48,6 +50,12 @@ TORQUES, SLIP, LIFT = range(3)
 TRIED_AT_ONCE = 4
 """Places in a step; where there are more lanes, the others repeat the last one."""
 _MOST_ROUNDS = 60
+FOOT_PARTS = 8
+"""Of a step, at most, at the ends of which the swing foot is looked at."""
+_OFF_CUBIC = 3e-4
+"""m: what the height of the foot differs from a cubic within 10 ms, at most."""
+_LOWEST_RESOLUTION = 1e-7  # s
+_COUNT = np.minimum(np.arange(1.0, FOOT_PARTS + LANES), FOOT_PARTS)[None]
 
 
 @inner_kernel
@@ -75,32 +83,38 @@ def foot_once(rob, w, lane, at):
 @inner_kernel
 def cubic_root(f0, d0, f1, d1):
     """Where the cubic with values f0 > 0 >= f1 and slopes d0, d1 at 0 and 1 vanishes, about."""
-    low, high = 0.0, 1.0
+    low, high = 0.0 * f0, 0.0 * f0 + 1.0
     at = f0 / (f0 - f1)
     c2 = 3.0 * (f1 - f0) - 2.0 * d0 - d1
     c3 = 2.0 * (f0 - f1) + d0 + d1
     for _ in range(3):
         value = f0 + at * (d0 + at * (c2 + at * c3))
-        if value > 0.0:
-            low = at
-        else:
-            high = at
+        above = value > 0.0
+        low = select(above, at, low)
+        high = select(above, high, at)
         at = at - value / (d0 + at * (2.0 * c2 + 3.0 * at * c3))
-        if not low < at < high:
-            at = 0.5 * (low + high)
+        at = select((at > low) & (at < high), at, 0.5 * (low + high))
     return at
 
 
 @inner_kernel
-def foot_root(rob, w, lane, nx, ny, low, high, at, span):
+def foot_root(rob, w, lane, nx, ny, low, high, at, searching, span):
     """Where ``nx x + ny y`` of the swing foot falls through zero, in lanes, by a guarded Newton.
 
     ``low`` and ``high`` are fractions of the step, of ``span`` seconds, with a positive value at
-    ``low`` and one not above zero at ``high``; ``at`` is a guess.
+    ``low`` and one not above zero at ``high``; ``at`` is a guess. Not all lanes need be searched.
+
+    Returns
+    -------
+    tuple
+        A fraction next to it and how far it is from there, by a last step of Newton's method; at
+        the fraction: angles and rates, sines and cosines of the angles, position of the foot (m).
     """
-    searching = at == at
+    a, da = state_at(w, lane, at)
+    s, c = sines(a)
+    x, y, dx, dy = foot(rob, s, c, da)
+    away = 0.0 * at
     for _ in range(100):
-        x, y, dx, dy = foot_at(rob, w, lane, at)
         value = nx * x + ny * y
         above = value > 0.0
         low = select(above, at, low)
@@ -108,84 +122,123 @@ def foot_root(rob, w, lane, nx, ny, low, high, at, span):
         nearer = at - value / ((nx * dx + ny * dy) * span)
         inside = (nearer >= low) & (nearer <= high)
         nearer = select(inside, nearer, 0.5 * (low + high))
-        moved = abs(nearer - at) * span
-        at = select(searching, nearer, at)
-        searching = searching & (moved >= select(inside, _NEWTON_RESOLUTION, TIME_RESOLUTION))
+        away = nearer - at
+        searching = searching & (
+            abs(away) * span >= select(inside, _NEWTON_RESOLUTION, TIME_RESOLUTION)
+        )
         if not any_lane(searching):
             break
-    return at
+        at = select(searching, nearer, at)
+        a, da = state_at(w, lane, at)
+        s, c = sines(a)
+        x, y, dx, dy = foot(rob, s, c, da)
+    return at, away, a, da, s, c, x, y
 
 
 @inner_kernel
 def root_once(rob, w, lane, nx, ny, low, high, at, span):
     """The same for one, as a number."""
-    found = foot_root(rob, w, lane, splat(nx), splat(ny), splat(low), splat(high), splat(at), span)
-    return lane_of(found, 0)
+    one = splat(at)
+    found, away, _, _, _, _, _, _ = foot_root(
+        rob, w, lane, splat(nx), splat(ny), splat(low), splat(high), one, one == one, span
+    )
+    return lane_of(found + away, 0)
 
 
 @inner_kernel
-def foot_lowest(rob, w, lane, nx, ny, low, high):
-    """Where ``nx x + ny y`` of the swing foot is least, given that it falls, then rises."""
-    for _ in range(50):
+def foot_lowest(rob, w, lane, nx, ny, low, high, span):
+    """Where ``nx x + ny y`` of the swing foot is least, in lanes, given that it falls, then rises.
+
+    Also how much that is, m: to some 1e-12, as it changes with the square of what the place is off.
+    """
+    while any_lane((high - low) * span > _LOWEST_RESOLUTION):
         at = 0.5 * (low + high)
-        _, _, dx, dy = foot_once(rob, w, lane, at)
-        if nx * dx + ny * dy < 0.0:
-            low = at
-        else:
-            high = at
-    return high
+        _, _, dx, dy = foot_at(rob, w, lane, at)
+        falls = nx * dx + ny * dy < 0.0
+        low = select(falls, at, low)
+        high = select(falls, high, at)
+    x, y, _, _ = foot_at(rob, w, lane, high)
+    return high, nx * x + ny * y
 
 
 @inner_kernel
-def may_dip(f0, d0, f1, d1):
+def may_dip(f0, d0, f1, d1, slack):
     """Whether a smooth function with these values and slopes at 0 and 1 may fall to zero between.
 
     The cubic through them is above the least of its four control points. What the function differs
-    from it is covered by 3 mm and a tenth of what they spread.
+    from it is covered by ``slack`` and a tenth of what they spread.
     """
     p0, p1 = f0 + d0 / 3.0, f1 - d1 / 3.0
-    least = min(min(f0, p0), min(p1, f1))
-    most = max(max(f0, p0), max(p1, f1))
-    return not least > 3e-3 + 0.1 * (most - least)
+    p0_first, f1_first = p0 < f0, f1 < p1
+    least, most = select(p0_first, p0, f0), select(p0_first, f0, p0)
+    low, high = select(f1_first, f1, p1), select(f1_first, p1, f1)
+    least, most = select(low < least, low, least), select(high > most, high, most)
+    return least <= slack + 0.1 * (most - least)
 
 
 @inner_kernel
-def first_below(rob, w, lane, nx, ny, offset, low, at_low, high, at_high, parts, span):
-    """Between which fractions the swing foot first comes down to ``nx x + ny y = offset``.
+def place_feet(rob, w, lane, end, parts):
+    """Put the swing foot between equal parts of the step up to ``end`` into the row FEET."""
+    for n in range(0, parts - 1, LANES):
+        x, y, dx, dy = foot_at(rob, w, lane, (end / parts) * load_from(_COUNT, 0, n))
+        i = 4 * (n // LANES)
+        store(w, FEET, i, x)
+        store(w, FEET, i + 1, y)
+        store(w, FEET, i + 2, dx)
+        store(w, FEET, i + 3, dy)
 
-    ``at_low`` and ``at_high`` are the foot there, as `foot_once` gives it. The step is looked at in
-    so many equal ``parts`` that within each the foot moves one way at most, and back; the foot
-    between them stands in row FEET.
+
+@inner_kernel
+def first_below(rob, w, lane, nx, ny, offset, low, at_low, high, at_high, end, parts, span):
+    """Between which fractions of a step the swing foot first comes down to a line, in lanes.
+
+    The line is ``nx x + ny y = offset``; ``at_low`` and ``at_high`` are the foot there, as
+    `foot_once` gives it. Within each of the parts of `place_feet` it moves one way at most, and
+    back.
 
     Returns
     -------
-    tuple of float
-        Fractions before and after, and a guess; three times 2 if it does not before ``high``.
+    tuple
+        Fractions before and after, and a guess; three times 2 where it does not before ``high``.
     """
     x, y, dx, dy = at_low
     f0, d0 = nx * x + ny * y - offset, (nx * dx + ny * dy) * span
-    k = int(low * parts)
-    while low < high:
+    before = 0.0 * nx + 2.0
+    after, guess = before, before
+    searching = before > 1.0
+    k = 0
+    while low < high and any_lane(searching):
         k += 1
-        until = high
+        until = (end / parts) * k
+        if until <= low and k < parts:
+            continue
         x, y, dx, dy = at_high
-        if k < parts and k < high * parts:
-            until = k / parts
-            i = 4 * (k - 1)
-            x, y = w[FEET, i, lane], w[FEET, i + 1, lane]
-            dx, dy = w[FEET, i + 2, lane], w[FEET, i + 3, lane]
+        if until < high and k < parts:
+            i, n = 4 * ((k - 1) // LANES), (k - 1) % LANES
+            x, y, dx, dy = w[FEET, i, n], w[FEET, i + 1, n], w[FEET, i + 2, n], w[FEET, i + 3, n]
+        else:
+            until = high
         f1, d1 = nx * x + ny * y - offset, (nx * dx + ny * dy) * span
         length = until - low
-        if not f1 > 0.0:
+        arrives = searching & (f1 <= 0.0)
+        if any_lane(arrives):
             at = low + length * cubic_root(f0, length * d0, f1, length * d1)
-            return low, until, at
-        if d0 < 0.0 and d1 > 0.0 and may_dip(f0, length * d0, f1, length * d1):
-            at = foot_lowest(rob, w, lane, nx, ny, low, until)
-            x, y, _, _ = foot_once(rob, w, lane, at)
-            if not nx * x + ny * y - offset > 0.0:
-                return low, at, 0.5 * (low + at)
+            before = select(arrives, low, before)
+            after = select(arrives, until, after)
+            guess = select(arrives, at, guess)
+            searching = searching & (f1 > 0.0)
+        dips = searching & (d0 < 0.0) & (d1 > 0.0)
+        if any_lane(dips):
+            dips = dips & may_dip(f0, length * d0, f1, length * d1, _OFF_CUBIC)
+            if any_lane(dips):
+                at, least = foot_lowest(rob, w, lane, nx, ny, splat(low), splat(until), span)
+                arrives = dips & (least <= offset)
+                before = select(arrives, low, before)
+                after = select(arrives, at, after)
+                guess = select(arrives, 0.5 * (low + at), guess)
+                searching = searching & (guess > 1.0)
         low, f0, d0 = until, f1, d1
-    return 2.0, 2.0, 2.0
+    return before, after, guess
 
 
 @inner_kernel

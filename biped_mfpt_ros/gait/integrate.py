@@ -472,6 +472,23 @@ def interpolate(w, lane, i, at):
 
 
 @inner_kernel
+def interpolated_slope(w, lane, i, at):
+    """Its derivative over ``at``."""
+    rest = 1.0 - at
+    value = w[DENSE + 5, i, lane] + at * w[DENSE + 6, i, lane]
+    slope = rest * w[DENSE + 6, i, lane] - value
+    value = w[DENSE + 4, i, lane] + rest * value
+    slope = at * slope + value
+    value = w[DENSE + 3, i, lane] + at * value
+    slope = rest * slope - value
+    value = w[DENSE + 2, i, lane] + rest * value
+    slope = at * slope + value
+    value = w[DENSE + 1, i, lane] + at * value
+    slope = rest * slope - value
+    return at * slope + (w[DENSE, i, lane] + rest * value)
+
+
+@inner_kernel
 def state_at(w, lane, at):
     """Angles and rates at the fraction ``at`` of the step."""
     a = (

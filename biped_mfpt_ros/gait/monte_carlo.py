@@ -17,10 +17,9 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait import step
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.scratch import VARIABLES, empty_scratch
-from biped_mfpt_ros.gait.swing import advance, begin, to_joint
+from biped_mfpt_ros.gait.swing import advance, begin, slopes_ahead, to_joint
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
-from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
@@ -40,7 +39,7 @@ def _walk(scheme, rob, par, states, previous, slopes, steps, outcomes):
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
     after = np.zeros((LANES, 1, STATE_SIZE))
     lane_outcomes, results = np.zeros((LANES, 1), np.uint8), np.zeros((LANES, 3, 1))
-    ground = np.empty((LANES, 1, 2))
+    ground = np.empty((LANES, 2, 1 + LANES))
     active = np.zeros(LANES, np.bool_)
     of, taken = np.full(LANES, -1), np.zeros(LANES, np.int64)
     trace = np.zeros((0, 0))
@@ -65,8 +64,7 @@ def _walk(scheme, rob, par, states, previous, slopes, steps, outcomes):
                 started += 1
             of[lane] = n
             if n >= 0:
-                sine, cosine = dynamics.sine_cosine(slopes[n, taken[lane]])
-                ground[lane, 0, 0], ground[lane, 0, 1] = sine, cosine
+                slopes_ahead(slopes[n, taken[lane] : taken[lane] + 1], ground[lane])
                 begin(
                     scheme,
                     rob,

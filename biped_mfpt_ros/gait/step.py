@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.scratch import EVALUATIONS, STEPS, VARIABLES, empty_scratch
-from biped_mfpt_ros.gait.swing import advance, begin, to_joint
+from biped_mfpt_ros.gait.swing import advance, begin, slopes_ahead, to_joint
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
-from biped_mfpt_ros.walker.dynamics import sine_cosine
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, SLOPE_LIMIT_DEG, check_slopes
@@ -53,11 +52,9 @@ def _simulate(
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
     after = np.zeros((LANES, m, STATE_SIZE))
     lane_outcomes, results = np.zeros((LANES, m), np.uint8), np.zeros((LANES, 3, m))
-    ground = np.empty((LANES, m, 2))
-    for i in range(m):
-        sine, cosine = sine_cosine(slopes[i])
-        for lane in range(LANES):
-            ground[lane, i, 0], ground[lane, i, 1] = sine, cosine
+    ground = np.empty((LANES, 2, m + LANES))
+    for lane in range(LANES):
+        slopes_ahead(slopes, ground[lane])
     active = np.zeros(LANES, np.bool_)
     of = np.full(LANES, -1)  # which state's swing each lane holds
     trace = np.zeros((0, 0))

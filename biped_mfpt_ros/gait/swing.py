@@ -25,6 +25,7 @@ from biped_mfpt_ros.gait.closed_loop import (
 )
 from biped_mfpt_ros.gait.events import (
     CUT_RESOLUTION,
+    FOOT_PARTS,
     LIFT,
     SLIP,
     TRIED_AT_ONCE,
@@ -34,12 +35,12 @@ from biped_mfpt_ros.gait.events import (
     cubic_root,
     first_below,
     first_change,
-    foot_at,
     foot_once,
     foot_root,
     force_once,
     may_dip,
     motion_at,
+    place_feet,
     root_once,
     slide_root,
     slip_root,
@@ -50,6 +51,7 @@ from biped_mfpt_ros.gait.integrate import (
     STAGES,
     estimated_error,
     interpolate,
+    interpolated_slope,
     prepare_dense,
     state_at,
     trial_step,
@@ -74,12 +76,10 @@ from biped_mfpt_ros.gait.scratch import (
     ESTIMATE,
     EVALUATIONS,
     FAILURE,
-    FEET,
     FOOT_DX,
     FOOT_DY,
     FOOT_X,
     FOOT_Y,
-    HIGH,
     IMPACTS,
     LAST_ERROR,
     LAST_H,
@@ -88,15 +88,12 @@ from biped_mfpt_ros.gait.scratch import (
     LENGTH,
     LOAD,
     LOBE,
-    LOW,
     LOWEST,
     MARGIN,
     MODE,
     MOST,
     NEAR,
     NORMAL,
-    NORMAL_X,
-    NORMAL_Y,
     PASSED,
     PLACES,
     SAMPLES,
@@ -124,7 +121,7 @@ from biped_mfpt_ros.gait.scratch import (
     Y,
 )
 from biped_mfpt_ros.jit import inner_kernel
-from biped_mfpt_ros.lanes import LANES, lane_of, load, select, splat, store
+from biped_mfpt_ros.lanes import LANES, lane_of, load, load_from, select, splat, store
 from biped_mfpt_ros.walker import impact
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.dynamics import foot, sine_cosine, sines
@@ -137,10 +134,10 @@ _CLEARANCE = 1e-9  # m, rounding of the height of a foot that stands on the grou
 _MOST_STEPS = 20_000  # integrator steps before a swing is given up
 _MOST_EVALUATIONS = 500_000  # the same for evaluations: a swing may crawl without a step accepted
 _SLIP_INTERVAL = 0.004  # s between samples of a step that may contain a slip
-_FOOT_INTERVAL = 0.02  # s: the foot moves one way at most within it, and back
-_MOST_PARTS = 4
-_LONGEST_STEP = _MOST_PARTS * _FOOT_INTERVAL
+_FOOT_INTERVAL = 0.01  # s: the foot moves one way at most within it, and back
+_LONGEST_STEP = FOOT_PARTS * _FOOT_INTERVAL
 _SHORTEST_STEP = 1e-9  # s, up to an event
+_OFF_CUBIC = 3e-3  # m: what the height of the foot differs from a cubic over a step, at most
 _TRACE_SAMPLES = 8  # of every integrator step
 SAMPLE_COLUMNS = 18  # of a trace: t, a (5), da (5), u (4), tangential, normal force, energy
 
@@ -185,6 +182,18 @@ def _root(error):
 
 
 @inner_kernel
+def slopes_ahead(slopes, out):
+    """Sines and cosines of ascending slopes, the steepest up first, the last one LANES times more.
+
+    ``slopes``: rad, shape (m,); ``out``: set, shape (2, m + LANES).
+    """
+    m = slopes.size
+    for i in range(m):
+        out[0, i], out[1, i] = sine_cosine(slopes[m - 1 - i])
+    out[0, m:], out[1, m:] = out[0, m - 1], out[1, m - 1]
+
+
+@inner_kernel
 def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, results):
     """Put a swing into a lane.
 
@@ -203,7 +212,7 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
     previous : float
         rad, slope of the ground behind the stance foot.
     slopes : numpy.ndarray
-        Sine and cosine of the slopes ahead, ascending, shape (m, 2).
+        Sines and cosines of the slopes ahead, as `slopes_ahead` puts them, shape (2, m + LANES).
     outcomes, results : numpy.ndarray
         Of the lane: codes, shape (m,), and durations (s), lengths (m), energies (J), shape (3, m).
     """
@@ -258,7 +267,7 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
             return
     back = (v[BACK_SIN, lane], v[BACK_COS, lane])
     todo = m
-    while todo > 0 and body_touches(rob, s, c, back, (slopes[todo - 1, 0], slopes[todo - 1, 1])):
+    while todo > 0 and body_touches(rob, s, c, back, (slopes[0, m - todo], slopes[1, m - todo])):
         todo -= 1
         outcomes[todo] = _BODY
     v[TODO, lane] = todo
@@ -343,7 +352,8 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
     active : numpy.ndarray
         Which lanes hold a swing that has not ended, bool, shape (LANES,); updated.
     slopes, outcomes, results : numpy.ndarray
-        As for `begin`, for each lane: shape (LANES, m, 2), (LANES, m), (LANES, 3, m).
+        As for `begin`, for each lane: shape (LANES, 2, m + LANES), (LANES, m),
+        (LANES, 3, m).
     after : numpy.ndarray
         States after impact (absolute angles) where the outcome is STEP, shape (LANES, m, 10).
     trace : numpy.ndarray
@@ -362,7 +372,8 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
     for lane in range(LANES):
         if active[lane]:
             v[EVALUATIONS, lane] += STAGES
-            if _inspect(scheme, rob, par, w, v, lane, slopes[lane]) or trace.shape[0] > 0:
+            m = outcomes.shape[1]
+            if _inspect(scheme, rob, par, w, v, lane, slopes[lane], m) or trace.shape[0] > 0:
                 v[EVALUATIONS, lane] += DENSE_STAGES
                 dense = True
     if dense:
@@ -405,7 +416,7 @@ def _end(v, lane, outcomes, results):
 
 
 @inner_kernel
-def _inspect(scheme, rob, par, w, v, lane, slopes):
+def _inspect(scheme, rob, par, w, v, lane, slopes, m):
     """Whether the step just tried is good, and whether something may happen in it.
 
     Returns whether its dense output is needed to find out.
@@ -432,8 +443,8 @@ def _inspect(scheme, rob, par, w, v, lane, slopes):
     s, c = lane_angles(w, END, lane), lane_rates(w, END, lane)  # where its sines and cosines stand
     x, y, dx, dy = foot(rob, s, c, lane_rates(w, Y_NEW, lane))
     v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane] = x, y, dx, dy
-    i = int(v[TODO, lane]) - 1
-    slope = (slopes[i, 0], slopes[i, 1])
+    i = m - int(v[TODO, lane])
+    slope = (slopes[0, i], slopes[1, i])
     back = (v[BACK_SIN, lane], v[BACK_COS, lane])
     near = body_touches(rob, s, c, back, slope)
     if v[FOOT_X, lane] < 0.0:
@@ -456,7 +467,7 @@ def _may_reach(v, lane, nx, ny, h):
     d0 = (nx * v[FOOT_DX, lane] + ny * v[FOOT_DY, lane]) * h
     f1 = nx * v[END_X, lane] + ny * v[END_Y, lane]
     d1 = (nx * v[END_DX, lane] + ny * v[END_DY, lane]) * h
-    return may_dip(f0, d0, f1, d1)
+    return may_dip(f0, d0, f1, d1, _OFF_CUBIC)
 
 
 @inner_kernel
@@ -626,14 +637,8 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
     others, which is ``failure`` if the foot does not come down behind.
     """
     h = w[MODE, H, lane]
-    parts = min(_MOST_PARTS, int(h / _FOOT_INTERVAL) + 1)
-    if parts > 1:
-        for k in range(LANES):
-            w[PLACES, AT, k] = (k + 1) / parts
-        x, y, dx, dy = foot_at(rob, w, lane, load(w, PLACES, AT))
-        for k in range(parts - 1):
-            w[FEET, 4 * k, lane], w[FEET, 4 * k + 1, lane] = lane_of(x, k), lane_of(y, k)
-            w[FEET, 4 * k + 2, lane], w[FEET, 4 * k + 3, lane] = lane_of(dx, k), lane_of(dy, k)
+    parts = min(FOOT_PARTS, int(end * h / _FOOT_INTERVAL) + 1)
+    place_feet(rob, w, lane, end, parts)
     at_start = (v[FOOT_X, lane], v[FOOT_Y, lane], v[FOOT_DX, lane], v[FOOT_DY, lane])
     at_end = (v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane])
     back = (v[BACK_SIN, lane], v[BACK_COS, lane])
@@ -645,9 +650,11 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
             low = _passing(rob, w, lane, -1.0, at_start, at_end, end, h)
             at_low = foot_once(rob, w, lane, low)
         # Behind the stance foot: against the ground of the preceding slope.
-        _, _, touch = first_below(
-            rob, w, lane, -back[0], back[1], v[LOWEST, lane], 0.0, at_start, low, at_low, parts, h
+        nx, ny = splat(-back[0]), splat(back[1])
+        _, _, guess = first_below(
+            rob, w, lane, nx, ny, v[LOWEST, lane], 0.0, at_start, low, at_low, end, parts, h
         )
+        touch = lane_of(guess, 0)
         if touch > 1.0 and at_end[0] >= 0.0 and not at_low[1] > 0.0:
             touch = low
         if touch <= stop:
@@ -662,43 +669,47 @@ def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failur
 
     # Slopes that the foot reaches in this step, the steepest first, some at once. Each is decided
     # by itself, so that its outcome does not depend on the others.
+    m = outcomes.size
     todo = int(v[TODO, lane])
     reached = LANES
-    while reached == LANES and todo > 0:
+    while reached == LANES and todo > 0 and low < high:
+        sine, cosine = load_from(slopes, 0, m - todo), load_from(slopes, 1, m - todo)
+        before, until, guess = first_below(
+            rob, w, lane, -sine, cosine, 0.0, low, at_low, high, at_high, end, parts, h
+        )
+        store(w, PLACES, AT, guess)
         reached = 0
-        while reached < LANES and reached < todo:
-            slope = (slopes[todo - 1 - reached, 0], slopes[todo - 1 - reached, 1])
-            before, until, guess = 2.0, 2.0, 2.0
-            if high > low:
-                before, until, guess = first_below(
-                    rob, w, lane, -slope[0], slope[1], 0.0, low, at_low, high, at_high, parts, h
-                )
-            if guess > 1.0:
-                break
-            for k in range(reached, LANES):  # what is left over does the same again
-                w[PLACES, LOW, k], w[PLACES, HIGH, k], w[PLACES, AT, k] = before, until, guess
-                w[PLACES, NORMAL_X, k], w[PLACES, NORMAL_Y, k] = -slope[0], slope[1]
+        while reached < min(LANES, todo) and w[PLACES, AT, reached] <= 1.0:
             reached += 1
-        if reached > 0:
-            _land(rob, w, v, lane, back, h)
-            for k in range(reached):
-                todo -= 1
-                slope = (slopes[todo, 0], slopes[todo, 1])
-                at = w[PLACES, AT, k]
-                if w[PLACES, TOUCHES, k] != 0.0:
-                    outcomes[todo] = _BODY
-                    at = body_root(rob, w, lane, back, slope, at)
-                    results[2, todo] = lane_of(_energy(w, v, lane, splat(at)), 0)
-                else:
-                    outcomes[todo] = _outcome(rob, w, k, slope, after[todo])
-                    results[2, todo] = w[PLACES, ENERGY_AT, k]
-                    if outcomes[todo] == _STEP:
-                        results[1, todo] = w[PLACES, LENGTH, k]
-                results[0, todo] = v[TIME, lane] + at * h
+        if reached == 0:
+            break
+        _land(rob, w, v, lane, sine, cosine, before, until, guess, back, h)
+        for k in range(reached):
+            todo -= 1
+            at = w[PLACES, AT, k]
+            if w[PLACES, TOUCHES, k] != 0.0:
+                outcomes[todo] = _BODY
+                slope = (slopes[0, m - 1 - todo], slopes[1, m - 1 - todo])
+                at = body_root(rob, w, lane, back, slope, at)
+                results[2, todo] = lane_of(_energy(w, v, lane, splat(at)), 0)
+            else:
+                slope = (slopes[0, m - 1 - todo], slopes[1, m - 1 - todo])
+                outcomes[todo] = _outcome(rob, w, k, slope)
+                results[2, todo] = w[PLACES, ENERGY_AT, k]
+                if outcomes[todo] == _STEP:
+                    results[1, todo] = math.sqrt(w[PLACES, LENGTH, k])
+                    for i in range(10):
+                        after[todo, i] = w[IMPACTS, i, k]
+            results[0, todo] = v[TIME, lane] + at * h
     # Slopes that the body reaches before the foot.
     while todo > 0:
-        slope = (slopes[todo - 1, 0], slopes[todo - 1, 1])
-        if not body_touches_at(rob, w, lane, stop, back, slope):
+        slope = (slopes[0, m - todo], slopes[1, m - todo])
+        if stop == end:
+            s, c = lane_angles(w, END, lane), lane_rates(w, END, lane)
+            touches = body_touches(rob, s, c, back, slope)
+        else:
+            touches = body_touches_at(rob, w, lane, stop, back, slope)
+        if not touches:
             break
         todo -= 1
         at = body_root(rob, w, lane, back, slope, stop)
@@ -718,44 +729,78 @@ def _passing(rob, w, lane, side, at_start, at_end, end, h):
 
 
 @inner_kernel
-def _land(rob, w, v, lane, back, h):
-    """Impacts on several slopes at once, which stand in the row PLACES; sets row IMPACTS too."""
-    nx, ny = load(w, PLACES, NORMAL_X), load(w, PLACES, NORMAL_Y)
-    at = foot_root(
-        rob, w, lane, nx, ny, load(w, PLACES, LOW), load(w, PLACES, HIGH), load(w, PLACES, AT), h
+def _land(rob, w, v, lane, sine, cosine, low, high, guess, back, h):
+    """Impacts on several slopes at once, where ``guess`` is at most 1; sets PLACES and IMPACTS."""
+    searching = guess <= 1.0
+    at, away, a, da, s, c, _, _ = foot_root(
+        rob, w, lane, -sine, cosine, low, high, select(searching, guess, 0.5), searching, h
     )
-    a, da = state_at(w, lane, at)
-    s, c = sines(a)
+    # There by first order: the motion is not evaluated again.
+    a, da, s, c = _moved(w, lane, at, away, a, da, s, c, h)
+    at = at + away
     x, y, _, _ = foot(rob, s, c, da)
-    touches = body_touches(rob, s, c, (splat(back[0]), splat(back[1])), (-nx, ny))
+    touches = body_touches(rob, s, c, (splat(back[0]), splat(back[1])), (sine, cosine))
     new_rates, px, py, vx, vy = impact.impact(rob, s, c, da)
     new = impact.swapped(a)
+    # Not finite as soon as one of them is not.
+    check = 0.0 * at
     for i in range(5):
         store(w, IMPACTS, i, new[i])
         store(w, IMPACTS, 5 + i, new_rates[i])
+        check = check + 0.0 * new[i]
+        check = check + 0.0 * new_rates[i]
     store(w, IMPACTS, 10, px)
     store(w, IMPACTS, 11, py)
     store(w, IMPACTS, 12, vx)
     store(w, IMPACTS, 13, vy)
     store(w, PLACES, AT, at)
+    store(w, PLACES, VALUE, check)
     store(w, PLACES, TOUCHES, select(touches, 1.0, 0.0 * at))
     store(w, PLACES, LENGTH, x * x + y * y)
     store(w, PLACES, ENERGY_AT, _energy(w, v, lane, at))
 
 
 @inner_kernel
-def _outcome(rob, w, place, slope, after):
-    """Outcome of an impact in the row IMPACTS; sets ``after``, in absolute angles."""
+def _moved(w, lane, at, away, a, da, s, c, h):
+    """Angles, rates, sines and cosines a little ``away`` from where they are, at ``at``."""
+    t = away * h
+    d = (t * da[0], t * da[1], t * da[2], t * da[3], t * da[4])
+    return (
+        (a[0] + d[0], a[1] + d[1], a[2] + d[2], a[3] + d[3], a[4] + d[4]),
+        (
+            da[0] + away * interpolated_slope(w, lane, 5, at),
+            da[1] + away * interpolated_slope(w, lane, 6, at),
+            da[2] + away * interpolated_slope(w, lane, 7, at),
+            da[3] + away * interpolated_slope(w, lane, 8, at),
+            da[4] + away * interpolated_slope(w, lane, 9, at),
+        ),
+        (
+            s[0] + d[0] * c[0],
+            s[1] + d[1] * c[1],
+            s[2] + d[2] * c[2],
+            s[3] + d[3] * c[3],
+            s[4] + d[4] * c[4],
+        ),
+        (
+            c[0] - d[0] * s[0],
+            c[1] - d[1] * s[1],
+            c[2] - d[2] * s[2],
+            c[3] - d[3] * s[3],
+            c[4] - d[4] * s[4],
+        ),
+    )
+
+
+@inner_kernel
+def _outcome(rob, w, place, slope):
+    """Outcome of an impact in the rows IMPACTS and PLACES."""
     sine, cosine = slope
-    for i in range(10):
-        after[i] = w[IMPACTS, i, place]
     px, py = w[IMPACTS, 10, place], w[IMPACTS, 11, place]
     vx, vy = w[IMPACTS, 12, place], w[IMPACTS, 13, place]
     normal = py * cosine - px * sine
     tangential = px * cosine + py * sine
-    for i in range(10):
-        if not math.isfinite(after[i]):
-            return _NOT_FINITE
+    if w[PLACES, VALUE, place] != 0.0:  # it is not a number
+        return _NOT_FINITE
     if not normal > 0.0:
         return _PULLS
     if rob[r.VERTICAL_FRICTION] != 0.0:
@@ -766,7 +811,6 @@ def _outcome(rob, w, place, slope, after):
         return _IMPACT_SLIPS
     if not vy * cosine - vx * sine > 0.0:
         return _NO_LIFT
-    w[PLACES, LENGTH, place] = math.sqrt(w[PLACES, LENGTH, place])
     return _STEP
 
 

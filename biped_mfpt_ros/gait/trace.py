@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.gait.scratch import SAMPLES, VARIABLES, empty_scratch
 from biped_mfpt_ros.gait.step import check_states
-from biped_mfpt_ros.gait.swing import SAMPLE_COLUMNS, advance, begin
+from biped_mfpt_ros.gait.swing import SAMPLE_COLUMNS, advance, begin, slopes_ahead
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker import dynamics
@@ -28,8 +28,8 @@ def _traced(scheme, rob, par, state, previous, slope, next_state, samples):
     active = np.zeros(LANES, np.bool_)
     outcomes, results = np.zeros((LANES, 1), np.uint8), np.zeros((LANES, 3, 1))
     after = np.zeros((LANES, 1, STATE_SIZE))
-    ground = np.empty((LANES, 1, 2))
-    ground[0, 0, 0], ground[0, 0, 1] = dynamics.sine_cosine(slope)
+    ground = np.empty((LANES, 2, 1 + LANES))
+    slopes_ahead(np.array([slope]), ground[0])
     begin(scheme, rob, par, w, v, 0, state, previous, ground[0], outcomes[0], results[0])
     active[0] = True
     while active[0]:
