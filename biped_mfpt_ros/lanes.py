@@ -12,6 +12,7 @@ Numba has no such type; this module adds it by numba's extension interface.
 
 from __future__ import annotations
 
+import math
 import operator
 import os
 from collections.abc import Callable
@@ -175,20 +176,37 @@ def _overload_select(condition, x, y):  # type: ignore[no-untyped-def]
     return lambda condition, x, y: x if condition else y
 
 
-@intrinsic
-def _magnitude(context, x):  # type: ignore[no-untyped-def]
-    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fabs.v{LANES}f64")
-        return builder.call(function, args)
+def _unary(name: str) -> Callable:
+    """An intrinsic function of LLVM, of lanes."""
 
-    return _lanes(_lanes), generate
+    @intrinsic
+    def function(context, x):  # type: ignore[no-untyped-def]
+        def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+            kind = ir.FunctionType(_VECTOR, [_VECTOR])
+            full_name = f"llvm.{name}.v{LANES}f64"
+            return builder.call(
+                cgutils.get_or_insert_function(builder.module, kind, full_name), args
+            )
+
+        return _lanes(_lanes), generate
+
+    return function
+
+
+_magnitude, _square_root = _unary("fabs"), _unary("sqrt")
 
 
 @overload(abs)
 def _overload_abs(x):  # type: ignore[no-untyped-def]
     if isinstance(x, _LanesType):
         return lambda x: _magnitude(x)
+    return None
+
+
+@overload(math.sqrt)
+def _overload_sqrt(x):  # type: ignore[no-untyped-def]
+    if isinstance(x, _LanesType):
+        return lambda x: _square_root(x)
     return None
 
 

@@ -30,9 +30,10 @@ from biped_mfpt_ros.gait.scratch import (
     COSINES,
     DENSE,
     END,
-    ERROR_3,
-    ERROR_5,
+    ERROR,
+    ERROR_ROOT,
     ESTIMATE,
+    GOOD,
     LEAST,
     LEAST_NORMAL,
     MODE,
@@ -354,7 +355,7 @@ def _stage(scheme, rob, par, w, h, stage, into, columns, mode):
 def trial_step(scheme, rob, par, w):
     """Try a step in all lanes, from row Y, whose derivative stands in row STAGE, to row Y_NEW.
 
-    Sets the rows ESTIMATE and END.
+    Sets the rows ESTIMATE and END. The step is good if the estimated error is at most 1.
     """
     mode = mode_of_all(w)
     h = load(w, MODE, H)
@@ -404,17 +405,26 @@ def trial_step(scheme, rob, par, w):
         five, three = five / scale, three / scale
         order_5 = order_5 + five * five
         order_3 = order_3 + three * three
-    store(w, ESTIMATE, ERROR_5, order_5)
-    store(w, ESTIMATE, ERROR_3, order_3)
+    size = (order_5 + 0.01 * order_3) * STATES
+    error = select(size == 0.0, 0.0, h * order_5 / math.sqrt(size))
+    store(w, ESTIMATE, ERROR, error)
+    store(w, ESTIMATE, ERROR_ROOT, eighth_root(error))
 
 
 @inner_kernel
-def estimated_error(w, lane):
-    """Estimated local error of the step over the tolerance: accepted if at most 1."""
-    five, three = w[ESTIMATE, ERROR_5, lane], w[ESTIMATE, ERROR_3, lane]
-    if five == 0.0 and three == 0.0:
-        return 0.0
-    return w[MODE, H, lane] * five / math.sqrt((five + 0.01 * three) * STATES)
+def eighth_root(error):
+    """By which a step of order 8 changes the error; the same on every machine."""
+    return math.sqrt(math.sqrt(math.sqrt(error)))
+
+
+@inner_kernel
+def take_step(w):
+    """Go on to the end of the step just tried, in the lanes where it is good."""
+    good = load(w, MODE, GOOD) != 0.0
+    for i in range(STATES):
+        store(w, Y, i, select(good, load(w, Y_NEW, i), load(w, Y, i)))
+    for i in range(SIZE):
+        store(w, STAGE, i, select(good, load(w, STAGE + STAGES, i), load(w, STAGE, i)))
 
 
 @inner_kernel

@@ -39,15 +39,17 @@ DENSE = STAGE + 16
 ROWS = DENSE + 7
 
 # Columns of MODE: signs of the torques cut off (4), whether the controller has switched (0 or 1),
-# length of the step (s), which outputs are in sliding mode (4, 0 or 1).
-CUT, SWITCHED, H, SLIDES = 0, 4, 5, 6
+# length of the step (s), which outputs are in sliding mode (4, 0 or 1), whether the step just tried
+# is good (0 or 1).
+CUT, SWITCHED, H, SLIDES, GOOD = 0, 4, 5, 6, 10
 # Columns of END: sines (5) and cosines (5) of the angles.
 SINES, COSINES = 0, 5
-# Columns of ESTIMATE: error of order 5 and of order 3, least and greatest margin against slipping
-# and least normal force over the stages (N), how far a torque is beyond its limit, at most (N m),
-# and at the end of the step: force (N), and the latter again; of four joints, the product of the
-# least and the greatest power over some stages (W^2): below zero where it changes its sign.
-ERROR_5, ERROR_3, LEAST, MOST, LEAST_NORMAL, BEYOND, TANGENTIAL, NORMAL, CLEARANCE = range(9)
+# Columns of ESTIMATE: error over the tolerance and its eighth root, least and greatest margin
+# against slipping and least normal force over the stages (N), how far a torque is beyond its limit,
+# at most (N m), and at the end of the step: force (N), and the latter again; of four joints, the
+# product of the least and the greatest power over some stages (W^2): below zero where it changes
+# its sign.
+ERROR, ERROR_ROOT, LEAST, MOST, LEAST_NORMAL, BEYOND, TANGENTIAL, NORMAL, CLEARANCE = range(9)
 TURNS = 9
 
 
@@ -82,7 +84,6 @@ TRIED, TRIED_VALUE = 4, 5
     EVALUATIONS,
     SAMPLES,  # in the trace
     FAILURE,  # outcome of the slopes not yet decided, once known; -1 before
-    ACCEPTED,  # 1 if the step just tried is good
     CHANGES,  # 1 if the set of torques cut off changes in it
     SWITCHES,  # 1 if the controller switches in it
     SLIPS,  # 1 if the stance foot may slip or lift in it
@@ -93,7 +94,8 @@ TRIED, TRIED_VALUE = 4, 5
     END_DY,
     SLIDE,  # 1 if an output begins to slide in it
     START_BEYOND,  # N m, how far torques are beyond their limits at the start of the step, at most
-    LAST_H,  # length and error of the step before, 0 if the motion was not smooth since then
-    LAST_ERROR,
+    LAST_H,  # length of the step before, 0 if the motion was not smooth since then
+    LAST_ROOT,  # eighth root of its error
+    RESTARTS,  # 1: the motion is evaluated anew, 2: also which torques are cut off
 ) = range(30)
 VARIABLES = 30

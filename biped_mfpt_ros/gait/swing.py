@@ -49,15 +49,15 @@ from biped_mfpt_ros.gait.events import (
 from biped_mfpt_ros.gait.integrate import (
     DENSE_STAGES,
     STAGES,
-    estimated_error,
+    eighth_root,
     interpolate,
     interpolated_slope,
     prepare_dense,
     state_at,
+    take_step,
     trial_step,
 )
 from biped_mfpt_ros.gait.scratch import (
-    ACCEPTED,
     AT,
     BACK_COS,
     BACK_SIN,
@@ -73,6 +73,8 @@ from biped_mfpt_ros.gait.scratch import (
     END_Y,
     ENERGY,
     ENERGY_AT,
+    ERROR,
+    ERROR_ROOT,
     ESTIMATE,
     EVALUATIONS,
     FAILURE,
@@ -80,9 +82,10 @@ from biped_mfpt_ros.gait.scratch import (
     FOOT_DY,
     FOOT_X,
     FOOT_Y,
+    GOOD,
     IMPACTS,
-    LAST_ERROR,
     LAST_H,
+    LAST_ROOT,
     LEAST,
     LEAST_NORMAL,
     LENGTH,
@@ -96,6 +99,7 @@ from biped_mfpt_ros.gait.scratch import (
     NORMAL,
     PASSED,
     PLACES,
+    RESTARTS,
     SAMPLES,
     SINCE,
     SINES,
@@ -138,6 +142,7 @@ _FOOT_INTERVAL = 0.01  # s: the foot moves one way at most within it, and back
 _LONGEST_STEP = FOOT_PARTS * _FOOT_INTERVAL
 _SHORTEST_STEP = 1e-9  # s, up to an event
 _OFF_CUBIC = 3e-3  # m: what the height of the foot differs from a cubic over a step, at most
+_LEAST_ROOT = 0.5623  # of an error of 0.01: smaller ones tell nothing about how errors grow
 _TRACE_SAMPLES = 8  # of every integrator step
 SAMPLE_COLUMNS = 18  # of a trace: t, a (5), da (5), u (4), tangential, normal force, energy
 
@@ -173,12 +178,6 @@ def _of_lane(x, lane):
         lane_of(x[3], lane),
         lane_of(x[4], lane),
     )
-
-
-@inner_kernel
-def _root(error):
-    """By which a step of order 8 changes the error: its eighth root, the same on every machine."""
-    return math.sqrt(math.sqrt(math.sqrt(error)))
 
 
 @inner_kernel
@@ -242,9 +241,10 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
     v[FAILURE, lane] = -1.0
     v[LAST_H, lane] = 0.0
     v[BACK_SIN, lane], v[BACK_COS, lane] = sine_cosine(previous)
-    w[MODE, H, lane] = 0.02 * _root(rob[r.TOLERANCE] / 1e-9)
+    w[MODE, H, lane] = 0.013 * eighth_root(rob[r.TOLERANCE] / 1e-9)
     w[MODE, SWITCHED, lane] = 0.0 if switch(scheme, par, lane_angles(w, Y, lane)) > 0.0 else 1.0
-    lanes_s, lanes_c, normal = _restart(scheme, rob, par, w, v, lane, True)
+    v[RESTARTS, lane] = 2.0
+    lanes_s, lanes_c, normal = _restart(scheme, rob, par, w, v)
     s, c = _of_lane(lanes_s, lane), _of_lane(lanes_c, lane)
     x, y, dx, dy = foot(rob, s, c, lane_rates(w, Y, lane))
     v[FOOT_X, lane], v[FOOT_Y, lane], v[FOOT_DX, lane], v[FOOT_DY, lane] = x, y, dx, dy
@@ -257,14 +257,11 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
     if not (x < 0.0 and height >= -FOOT_TOLERANCE):
         v[FAILURE, lane] = _SCUFFS
         return
-    if not normal > _unloaded(rob):
+    if not lane_of(normal, lane) > _unloaded(rob):
         v[FAILURE, lane] = _LIFTS
         return
-    if not v[MARGIN, lane] > 0.0:
-        v[SINCE, lane] = 0.0
-        if rob[r.SLIP_DURATION] == 0.0:
-            v[FAILURE, lane] = _SLIPS
-            return
+    if v[FAILURE, lane] >= 0.0:
+        return
     back = (v[BACK_SIN, lane], v[BACK_COS, lane])
     todo = m
     while todo > 0 and body_touches(rob, s, c, back, (slopes[0, m - todo], slopes[1, m - todo])):
@@ -274,34 +271,51 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
 
 
 @inner_kernel
-def _restart(scheme, rob, par, w, v, lane, afresh):
-    """Evaluate the closed loop at row Y, for the next step; ``afresh``: find what is cut off.
+def _restart(scheme, rob, par, w, v):
+    """Evaluate the closed loop at row Y, for the next step, in the lanes that RESTARTS names.
 
-    Returns sines and cosines of the angles, and the force on the stance foot, in all lanes.
+    Where what is cut off is found afresh, torques have jumped, and the stance foot may slip.
+    Returns sines and cosines of the angles, and the normal force, in all lanes.
     """
-    if afresh:
-        for i in range(4):
-            w[MODE, CUT + i, lane] = 0.0
-            w[MODE, SLIDES + i, lane] = 0.0
+    for lane in range(LANES):
+        if v[RESTARTS, lane] > 1.0:
+            for i in range(4):
+                w[MODE, CUT + i, lane] = 0.0
+                w[MODE, SLIDES + i, lane] = 0.0
     mode = mode_of_all(w)
     dda, wanted, applied, force, s, c = motion(scheme, rob, par, w, Y, mode)
-    v[EVALUATIONS, lane] += 1
-    if afresh and lane_of(beyond(rob, mode[0], wanted), lane) > 0.0:
-        for i in range(4):
-            w[MODE, CUT + i, lane] = lane_of(cut_off(rob, wanted[i]), lane)
+    over = beyond(rob, mode[0], wanted)
+    again = False
+    for lane in range(LANES):
+        if v[RESTARTS, lane] > 1.0 and lane_of(over, lane) > 0.0:
+            for i in range(4):
+                w[MODE, CUT + i, lane] = cut_off(rob, lane_of(wanted[i], lane))
+            v[EVALUATIONS, lane] += 1
+            again = True
+    if again:
         mode = mode_of_all(w)
         dda, wanted, applied, force, s, c = motion(scheme, rob, par, w, Y, mode)
-        v[EVALUATIONS, lane] += 1
+        over = beyond(rob, mode[0], wanted)
     da = rates(w, Y)
     power = powers(applied, da)
-    for i in range(5):
-        w[STAGE, i, lane] = lane_of(da[i], lane)
-        w[STAGE, 5 + i, lane] = lane_of(dda[i], lane)
-    for i in range(4):
-        w[STAGE, WORK + i, lane] = lane_of(power[i], lane)
-    v[MARGIN, lane] = lane_of(margin(rob, force), lane)
-    v[START_BEYOND, lane] = lane_of(beyond(rob, mode[0], wanted), lane)
-    return s, c, lane_of(force[1], lane)
+    spare = margin(rob, force)
+    unloaded = _unloaded(rob)
+    for lane in range(LANES):
+        if v[RESTARTS, lane] != 0.0:
+            v[EVALUATIONS, lane] += 1
+            for i in range(5):
+                w[STAGE, i, lane] = lane_of(da[i], lane)
+                w[STAGE, 5 + i, lane] = lane_of(dda[i], lane)
+            for i in range(4):
+                w[STAGE, WORK + i, lane] = lane_of(power[i], lane)
+            v[MARGIN, lane] = lane_of(spare, lane)
+            v[START_BEYOND, lane] = lane_of(over, lane)
+            if v[RESTARTS, lane] > 1.0 and v[SINCE, lane] < 0.0 and not v[MARGIN, lane] > 0.0:
+                v[SINCE, lane] = v[TIME, lane]
+                if rob[r.SLIP_DURATION] == 0.0:
+                    v[FAILURE, lane] = _SLIPS if lane_of(force[1], lane) > unloaded else _LIFTS
+            v[RESTARTS, lane] = 0.0
+    return s, c, force[1]
 
 
 @inner_kernel
@@ -327,7 +341,7 @@ def _choose_slides(par, w, lane, may):
     cut = False
     for i in range(4):
         cut = cut or w[MODE, CUT + i, lane] != 0.0
-    a, da = lane_angles(w, Y, lane), lane_rates(w, Y, lane)
+    a, da = lane_angles(w, Y_NEW, lane), lane_rates(w, Y_NEW, lane)
     for i in range(4):
         slides = w[MODE, SLIDES + i, lane] != 0.0
         off = math.inf
@@ -360,6 +374,7 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
         Samples of the swing in lane 0, shape (k, SAMPLE_COLUMNS); k = 0: none are wanted.
     """
     for lane in range(LANES):
+        w[MODE, GOOD, lane] = 0.0
         if active[lane]:
             _propose(rob, w, v, lane)
             if v[FAILURE, lane] >= 0.0 or v[TODO, lane] == 0.0:
@@ -379,7 +394,7 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
     if dense:
         prepare_dense(scheme, rob, par, w)
     for lane in range(LANES):
-        if active[lane] and v[ACCEPTED, lane] != 0.0:
+        if w[MODE, GOOD, lane] != 0.0:
             _finish(
                 scheme,
                 rob,
@@ -393,6 +408,9 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
                 after[lane],
                 trace,
             )
+    take_step(w)
+    if v[RESTARTS].any():
+        _restart(scheme, rob, par, w, v)
 
 
 @inner_kernel
@@ -421,15 +439,16 @@ def _inspect(scheme, rob, par, w, v, lane, slopes, m):
 
     Returns whether its dense output is needed to find out.
     """
-    error = estimated_error(w, lane)
+    error = w[ESTIMATE, ERROR, lane]
     h = w[MODE, H, lane]
     if not error <= 1.0:
-        v[ACCEPTED, lane] = 0.0
         if h < 1e-13 or (not math.isfinite(error) and h < 1e-9):
             v[FAILURE, lane] = _NOT_FINITE
-        w[MODE, H, lane] = h * (max(0.2, 0.9 / _root(error)) if math.isfinite(error) else 0.1)
+        w[MODE, H, lane] = h * (
+            max(0.2, 0.9 / w[ESTIMATE, ERROR_ROOT, lane]) if math.isfinite(error) else 0.1
+        )
         return False
-    v[ACCEPTED, lane] = 1.0
+    w[MODE, GOOD, lane] = 1.0
     v[STEPS, lane] += 1.0
     changes = w[ESTIMATE, BEYOND, lane] > CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
     switched = w[MODE, SWITCHED, lane] > 0.5
@@ -512,6 +531,7 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
             until = min(stop, (results[0, 0] - t) / h)
         _sample(scheme, rob, par, w, v, trace, until)
     if failure >= 0:
+        w[MODE, GOOD, lane] = 0.0
         v[FAILURE, lane] = failure
         v[ENERGY, lane] = lane_of(_energy(w, v, lane, splat(stop)), 0)
         v[TIME, lane] = t + stop * h
@@ -521,33 +541,24 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
     v[TIME, lane] = t + end * h
     v[FOOT_X, lane], v[FOOT_Y, lane] = v[END_X, lane], v[END_Y, lane]
     v[FOOT_DX, lane], v[FOOT_DY, lane] = v[END_DX, lane], v[END_DY, lane]
-    for i in range(STATES):
-        w[Y, i, lane] = w[Y_NEW, i, lane]
-    error = estimated_error(w, lane)
-    w[MODE, H, lane] = h * _growth(v, lane, h, error)
+    w[MODE, H, lane] = h * _growth(w, v, lane, h)
     if joint >= 0:
         w[MODE, CUT + joint, lane] = held
     if switches:
         w[MODE, SWITCHED, lane] = 1.0 - w[MODE, SWITCHED, lane]
         w[MODE, H, lane] = min(w[MODE, H, lane], 0.25 * h)
     slides = scheme == SMC and not switches and _choose_slides(par, w, lane, v[SLIDE, lane] != 0.0)
-    v[LAST_H, lane], v[LAST_ERROR, lane] = h, max(error, 1e-2)
+    v[LAST_H, lane], v[LAST_ROOT, lane] = h, max(w[ESTIMATE, ERROR_ROOT, lane], _LEAST_ROOT)
     if end < 1.0 or joint >= 0 or switches or slides:
         v[LAST_H, lane] = 0.0
-        _, _, normal = _restart(scheme, rob, par, w, v, lane, switches)
-        if switches and v[SINCE, lane] < 0.0 and not v[MARGIN, lane] > 0.0:
-            v[SINCE, lane] = v[TIME, lane]
-            if rob[r.SLIP_DURATION] == 0.0:
-                v[FAILURE, lane] = _SLIPS if normal > _unloaded(rob) else _LIFTS
+        v[RESTARTS, lane] = 2.0 if switches else 1.0
     else:
-        for i in range(SIZE):
-            w[STAGE, i, lane] = w[STAGE + STAGES, i, lane]
         v[START_BEYOND, lane] = w[ESTIMATE, CLEARANCE, lane]
         v[MARGIN, lane] = margin(rob, (w[ESTIMATE, TANGENTIAL, lane], w[ESTIMATE, NORMAL, lane]))
 
 
 @inner_kernel
-def _growth(v, lane, h, error):
+def _growth(w, v, lane, h):
     """By which the next step may be longer, from the errors of this one and the one before.
 
     Where errors grow from step to step, the next one is shortened in time [1]_.
@@ -555,11 +566,12 @@ def _growth(v, lane, h, error):
     .. [1] K. Gustafsson, "Control-theoretic techniques for stepsize selection in implicit
        Runge-Kutta methods", ACM Transactions on Mathematical Software 20 (1994).
     """
-    if error < 1e-6:
+    root = w[ESTIMATE, ERROR_ROOT, lane]
+    if 5.0 * root < 0.9:
         return 5.0
-    factor = min(5.0, 0.9 / _root(error))
+    factor = 0.9 / root
     if v[LAST_H, lane] > 0.0:
-        trend = h / v[LAST_H, lane] * _root(v[LAST_ERROR, lane] / error)
+        trend = h * v[LAST_ROOT, lane] / (v[LAST_H, lane] * root)
         factor = min(factor, max(0.2, factor * trend))
     return factor
 
