@@ -160,6 +160,9 @@ _NOT_FINITE = int(Outcome.NOT_FINITE)
 _OPEN = 255  # not yet decided
 _N1, _N2, _N3 = 1.0 / 3.0, 0.6, 6.0 / 7.0  # when the integrator's stages 5, 9 and 10 are
 _NODES = (0.0, _N1, _N2, _N3, 1.0)
+_PER_1, _PER_2, _PER_3 = 1.0 / _N1, 1.0 / _N2, 1.0 / _N3
+_PER_12, _PER_13, _PER_14 = 1.0 / (_N2 - _N1), 1.0 / (_N3 - _N1), 1.0 / (1.0 - _N1)
+_PER_23, _PER_24, _PER_34 = 1.0 / (_N3 - _N2), 1.0 / (1.0 - _N2), 1.0 / (1.0 - _N3)
 
 
 @inner_kernel
@@ -855,15 +858,15 @@ def _find_lobes(w, lane):
             p2, p3 = w[STAGE + 9, column, lane], w[STAGE + 10, column, lane]
             p4 = w[STAGE + STAGES, column, lane]
             # Newton's divided differences on the nodes, then powers of the fraction.
-            d1 = (p1 - p0) / _N1
-            e2 = (p2 - p1) / (_N2 - _N1)
-            e3 = (p3 - p2) / (_N3 - _N2)
-            e4 = (p4 - p3) / (1.0 - _N3)
-            d2 = (e2 - d1) / _N2
-            f3 = (e3 - e2) / (_N3 - _N1)
-            f4 = (e4 - e3) / (1.0 - _N2)
-            d3 = (f3 - d2) / _N3
-            d4 = (f4 - f3) / (1.0 - _N1) - d3
+            d1 = (p1 - p0) * _PER_1
+            e2 = (p2 - p1) * _PER_12
+            e3 = (p3 - p2) * _PER_23
+            e4 = (p4 - p3) * _PER_34
+            d2 = (e2 - d1) * _PER_2
+            f3 = (e3 - e2) * _PER_13
+            f4 = (e4 - e3) * _PER_24
+            d3 = (f3 - d2) * _PER_3
+            d4 = (f4 - f3) * _PER_14 - d3
             b3 = d3 - d4 * (_N1 + _N2 + _N3)
             b2 = d2 - d3 * (_N1 + _N2) + d4 * (_N1 * _N2 + _N1 * _N3 + _N2 * _N3)
             b1 = d1 - d2 * _N1 + d3 * _N1 * _N2 - d4 * _N1 * _N2 * _N3
@@ -873,7 +876,8 @@ def _find_lobes(w, lane):
                 high, after = _NODES[k + 1], (p1, p2, p3, p4)[k]
                 if before * after < 0.0:
                     at = low + (high - low) * before / (before - after)
-                    for _ in range(4):
+                    # The work changes with the square of what the place is off.
+                    for _ in range(2):
                         value = p0 + at * (b1 + at * (b2 + at * (b3 + at * d4)))
                         if (value > 0.0) == (before > 0.0):
                             low = at
@@ -883,7 +887,7 @@ def _find_lobes(w, lane):
                         at -= value / slope
                         if not low < at < high:
                             at = 0.5 * (low + high)
-                    work = p0 + at * (b1 / 2.0 + at * (b2 / 3.0 + at * (b3 / 4.0 + at * d4 / 5.0)))
+                    work = p0 + at * (0.5 * b1 + at * (_N1 * b2 + at * (0.25 * b3 + at * 0.2 * d4)))
                     w[row, found, lane] = at
                     w[row, 4 + found, lane] = h * at * work
                     found += 1
