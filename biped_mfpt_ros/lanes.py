@@ -232,22 +232,6 @@ def load(context, array, row, i):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def load_from(context, array, row, first):  # type: ignore[no-untyped-def]
-    """Lanes ``array[row, first : first + LANES]`` of a contiguous array of two dimensions."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
-        matrix = context.make_array(sig.args[0])(context, builder, args[0])
-        width = builder.extract_value(matrix.shape, 1)
-        i, k = (context.cast(builder, args[n], sig.args[n], types.intp) for n in (1, 2))
-        place = builder.gep(matrix.data, [builder.add(builder.mul(i, width), k)])
-        value = builder.load(builder.bitcast(place, _VECTOR.as_pointer()))
-        value.align = 8
-        return value
-
-    return _lanes(array, row, first), generate
-
-
-@intrinsic
 def store(context, array, row, i, value):  # type: ignore[no-untyped-def]
     """Put lanes, or one number, into ``array[row, i, :]``."""
 
@@ -257,6 +241,39 @@ def store(context, array, row, i, value):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     return types.void(array, row, i, value), generate
+
+
+def _pointer_from(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+    """Where ``array[row, first]`` stands; the array is contiguous and has two dimensions."""
+    array = context.make_array(sig.args[0])(context, builder, args[0])
+    width = builder.extract_value(array.shape, 1)
+    row, first = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (1, 2))
+    place = builder.add(builder.mul(row, width), first)
+    return builder.bitcast(builder.gep(array.data, [place]), _VECTOR.as_pointer())
+
+
+@intrinsic
+def load_from(context, array, row, first):  # type: ignore[no-untyped-def]
+    """Lanes ``array[row, first : first + LANES]`` of a contiguous array of shape (rows, k)."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        value = builder.load(_pointer_from(context, builder, sig, args))
+        value.align = 8
+        return value
+
+    return _lanes(array, row, first), generate
+
+
+@intrinsic
+def store_into(context, array, row, first, value):  # type: ignore[no-untyped-def]
+    """Put lanes, or one number, into ``array[row, first : first + LANES]``."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        lanes = _vector(context, builder, args[3], sig.args[3])
+        builder.store(lanes, _pointer_from(context, builder, sig, args)).align = 8
+        return context.get_dummy_value()
+
+    return types.void(array, row, first, value), generate
 
 
 @intrinsic

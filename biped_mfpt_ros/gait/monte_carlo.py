@@ -16,12 +16,13 @@ from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait import step
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
-from biped_mfpt_ros.gait.scratch import VARIABLES, empty_scratch
-from biped_mfpt_ros.gait.swing import advance, begin, slopes_ahead, to_joint
+from biped_mfpt_ros.gait.ground import slopes_ahead, to_joint
+from biped_mfpt_ros.gait.scratch import AHEAD, OUTCOME, VARIABLES, empty_scratch
+from biped_mfpt_ros.gait.swing import advance, begin
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker.outcome import Outcome
-from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel
+from biped_mfpt_ros.walker.robot import WalkerModel
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
 
 _BLOCK_WALKS = 64  # walks in a job: some ten milliseconds of work
@@ -37,9 +38,7 @@ def _walk(scheme, rob, par, states, previous, slopes, steps, outcomes):
     """
     walks, length = slopes.shape
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
-    after = np.zeros((LANES, 1, STATE_SIZE))
-    lane_outcomes, results = np.zeros((LANES, 1), np.uint8), np.zeros((LANES, 3, 1))
-    ground = np.empty((LANES, 2, 1 + LANES))
+    ahead = np.zeros((LANES, AHEAD, 1 + LANES))
     active = np.zeros(LANES, np.bool_)
     of, taken = np.full(LANES, -1), np.zeros(LANES, np.int64)
     trace = np.zeros((0, 0))
@@ -52,10 +51,10 @@ def _walk(scheme, rob, par, states, previous, slopes, steps, outcomes):
             if n >= 0:
                 k = taken[lane]
                 steps[n] += 1
-                outcomes[n] = lane_outcomes[lane, 0]
+                outcomes[n] = int(ahead[lane, OUTCOME, 0])
                 if outcomes[n] == _STEP:
                     previous[n] = slopes[n, k]
-                    to_joint(after[lane, 0], states[n])
+                    to_joint(ahead[lane], 0, states[n])
                     taken[lane] += 1
                 if outcomes[n] != _STEP or taken[lane] == length:
                     n = -1
@@ -64,7 +63,7 @@ def _walk(scheme, rob, par, states, previous, slopes, steps, outcomes):
                 started += 1
             of[lane] = n
             if n >= 0:
-                slopes_ahead(slopes[n, taken[lane] : taken[lane] + 1], ground[lane])
+                slopes_ahead(slopes[n, taken[lane] : taken[lane] + 1], ahead[lane])
                 begin(
                     scheme,
                     rob,
@@ -74,14 +73,12 @@ def _walk(scheme, rob, par, states, previous, slopes, steps, outcomes):
                     lane,
                     states[n],
                     previous[n],
-                    ground[lane],
-                    lane_outcomes[lane],
-                    results[lane],
+                    ahead[lane],
                 )
                 active[lane] = True
         if not active.any():
             return
-        advance(scheme, rob, par, w, v, active, ground, lane_outcomes, results, after, trace)
+        advance(scheme, rob, par, w, v, active, ahead, trace)
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,10 @@ WORK = 10
     COMMAND,  # what a controller commands: alpha (5), beta (5)
     END,  # where the step ends, columns below
     ESTIMATE,  # of the error, and what else was seen in the stages, columns below
-    FEET,  # swing foot within the step: x, y (m), dx, dy (m/s) at up to three places
+    FEET,  # swing foot within the step: x, y (m), dx, dy (m/s), some places in the lanes
     PLACES,  # of one lane, at as many fractions of the step as there are lanes: columns below
-    IMPACTS,  # the same: angles (5), rates after the impact (5), impulse (2), velocity (2)
-) = range(10)
-LOBE = 10
+) = range(9)
+LOBE = 9
 """Row of the first of four joints: up to four fractions of the step where the joint's power changes
 its sign, 2 after the last, then its work up to each of them (J)."""
 STAGE = LOBE + 4
@@ -59,11 +58,23 @@ def empty_scratch():
     return np.zeros((ROWS, SIZE, LANES))
 
 
-# Columns of PLACES: fraction, between which fractions, normal of the slope, how it turned out.
-AT, LOW, HIGH, NORMAL_X, NORMAL_Y, FOUND, VALUE, LOAD, ENERGY_AT, LENGTH, TOUCHES = range(11)
+# Columns of PLACES: fraction, a value and the normal force there; while a crossing is sought,
+# fraction, value and the torques wanted (4).
+AT, VALUE, LOAD, TRIED, TRIED_VALUE, TRIED_TORQUES = range(6)
 
-# Columns of IMPACTS while a crossing is sought, after torques wanted (4): fractions, values there.
-TRIED, TRIED_VALUE = 4, 5
+# Rows of the ground ahead of a lane, of shape (AHEAD, m + LANES), one column for a slope.
+(
+    SINE,
+    COSINE,
+    OUTCOME,  # code
+    DURATION,  # s, to the impact or to the fall
+    LENGTH,  # m, from foot to foot at impact; 0 for a fall
+    SPENT,  # J
+) = range(6)
+ANGLES, RATES, TRIG = 6, 11, 16
+"""Absolute angles (rad), their rates (rad/s), and their sines and cosines (5 each): just before the
+impact while the swing lasts, angles and rates after the impact then."""
+AHEAD = 26
 
 # Rows of a swing's variables, of shape (VARIABLES, LANES).
 (

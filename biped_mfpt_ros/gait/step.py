@@ -14,8 +14,19 @@ from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.gait.scratch import EVALUATIONS, STEPS, VARIABLES, empty_scratch
-from biped_mfpt_ros.gait.swing import advance, begin, slopes_ahead, to_joint
+from biped_mfpt_ros.gait.ground import slopes_ahead, to_joint
+from biped_mfpt_ros.gait.scratch import (
+    AHEAD,
+    DURATION,
+    EVALUATIONS,
+    LENGTH,
+    OUTCOME,
+    SPENT,
+    STEPS,
+    VARIABLES,
+    empty_scratch,
+)
+from biped_mfpt_ros.gait.swing import advance, begin
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker.outcome import Outcome
@@ -50,11 +61,9 @@ def _simulate(
     """
     n, m = outcomes.shape
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
-    after = np.zeros((LANES, m, STATE_SIZE))
-    lane_outcomes, results = np.zeros((LANES, m), np.uint8), np.zeros((LANES, 3, m))
-    ground = np.empty((LANES, 2, m + LANES))
+    ahead = np.zeros((LANES, AHEAD, m + LANES))
     for lane in range(LANES):
-        slopes_ahead(slopes, ground[lane])
+        slopes_ahead(slopes, ahead[lane])
     active = np.zeros(LANES, np.bool_)
     of = np.full(LANES, -1)  # which state's swing each lane holds
     trace = np.zeros((0, 0))
@@ -70,12 +79,13 @@ def _simulate(
                 of[lane] = -1
                 costs[k, 0], costs[k, 1] = int(v[STEPS, lane]), int(v[EVALUATIONS, lane])
                 for i in range(m):
-                    outcomes[k, i] = lane_outcomes[lane, i]
-                    durations[k, i] = results[lane, 0, i]
-                    lengths[k, i] = results[lane, 1, i]
-                    energies[k, i] = results[lane, 2, i]
+                    j = m - 1 - i
+                    outcomes[k, i] = int(ahead[lane, OUTCOME, j])
+                    durations[k, i] = ahead[lane, DURATION, j]
+                    lengths[k, i] = ahead[lane, LENGTH, j]
+                    energies[k, i] = ahead[lane, SPENT, j]
                     if outcomes[k, i] == _STEP:
-                        to_joint(after[lane, i], following[k * m + i])
+                        to_joint(ahead[lane], j, following[k * m + i])
             if started < n and evaluations + v[EVALUATIONS].sum() < most_evaluations:
                 evaluations += int(v[EVALUATIONS, lane])
                 begin(
@@ -87,15 +97,13 @@ def _simulate(
                     lane,
                     states[started],
                     previous[started],
-                    ground[lane],
-                    lane_outcomes[lane],
-                    results[lane],
+                    ahead[lane],
                 )
                 of[lane], active[lane] = started, True
                 started += 1
         if not active.any():
             break
-        advance(scheme, rob, par, w, v, active, ground, lane_outcomes, results, after, trace)
+        advance(scheme, rob, par, w, v, active, ahead, trace)
     count = done = steps = evaluations = 0
     while done < started and (done == 0 or evaluations < most_evaluations):
         steps += costs[done, 0]

@@ -23,35 +23,32 @@ from biped_mfpt_ros.gait.closed_loop import (
     rates,
     switch,
 )
+from biped_mfpt_ros.gait.energy import energy_at, energy_at_end, find_lobes
 from biped_mfpt_ros.gait.events import (
     CUT_RESOLUTION,
-    FOOT_PARTS,
     LIFT,
     SLIP,
     TRIED_AT_ONCE,
-    body_root,
-    body_touches,
-    body_touches_at,
-    cubic_root,
-    first_below,
     first_change,
-    foot_once,
-    foot_root,
     force_once,
-    may_dip,
     motion_at,
-    place_feet,
-    root_once,
     slide_root,
     slip_root,
     switch_root,
+)
+from biped_mfpt_ros.gait.ground import (
+    FOOT_INTERVAL,
+    FOOT_PARTS,
+    body_touches,
+    impacts,
+    may_dip,
+    meet_ground,
 )
 from biped_mfpt_ros.gait.integrate import (
     DENSE_STAGES,
     STAGES,
     eighth_root,
     interpolate,
-    interpolated_slope,
     prepare_dense,
     state_at,
     take_step,
@@ -64,15 +61,16 @@ from biped_mfpt_ros.gait.scratch import (
     BEYOND,
     CHANGES,
     CLEARANCE,
+    COSINE,
     COSINES,
     CUT,
+    DURATION,
     END,
     END_DX,
     END_DY,
     END_X,
     END_Y,
     ENERGY,
-    ENERGY_AT,
     ERROR,
     ERROR_ROOT,
     ESTIMATE,
@@ -83,30 +81,31 @@ from biped_mfpt_ros.gait.scratch import (
     FOOT_X,
     FOOT_Y,
     GOOD,
-    IMPACTS,
     LAST_H,
     LAST_ROOT,
     LEAST,
     LEAST_NORMAL,
     LENGTH,
     LOAD,
-    LOBE,
     LOWEST,
     MARGIN,
     MODE,
     MOST,
     NEAR,
     NORMAL,
+    OUTCOME,
     PASSED,
     PLACES,
     RESTARTS,
     SAMPLES,
     SINCE,
+    SINE,
     SINES,
     SIZE,
     SLIDE,
     SLIDES,
     SLIPS,
+    SPENT,
     STAGE,
     START_BEYOND,
     STATES,
@@ -116,8 +115,6 @@ from biped_mfpt_ros.gait.scratch import (
     TANGENTIAL,
     TIME,
     TODO,
-    TOUCHES,
-    TURNS,
     VALUE,
     WORK,
     Y_NEW,
@@ -125,8 +122,7 @@ from biped_mfpt_ros.gait.scratch import (
     Y,
 )
 from biped_mfpt_ros.jit import inner_kernel
-from biped_mfpt_ros.lanes import LANES, lane_of, load, load_from, select, splat, store
-from biped_mfpt_ros.walker import impact
+from biped_mfpt_ros.lanes import LANES, lane_of, load, splat, store
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.dynamics import foot, sine_cosine, sines
 from biped_mfpt_ros.walker.outcome import Outcome
@@ -138,31 +134,19 @@ _CLEARANCE = 1e-9  # m, rounding of the height of a foot that stands on the grou
 _MOST_STEPS = 20_000  # integrator steps before a swing is given up
 _MOST_EVALUATIONS = 500_000  # the same for evaluations: a swing may crawl without a step accepted
 _SLIP_INTERVAL = 0.004  # s between samples of a step that may contain a slip
-_FOOT_INTERVAL = 0.01  # s: the foot moves one way at most within it, and back
-_LONGEST_STEP = FOOT_PARTS * _FOOT_INTERVAL
+_LONGEST_STEP = FOOT_PARTS * FOOT_INTERVAL  # s
 _SHORTEST_STEP = 1e-9  # s, up to an event
 _OFF_CUBIC = 3e-3  # m: what the height of the foot differs from a cubic over a step, at most
 _LEAST_ROOT = 0.5623  # of an error of 0.01: smaller ones tell nothing about how errors grow
 _TRACE_SAMPLES = 8  # of every integrator step
 SAMPLE_COLUMNS = 18  # of a trace: t, a (5), da (5), u (4), tangential, normal force, energy
 
-_STEP = int(Outcome.STEP)
 _LIFTS = int(Outcome.STANCE_LIFTS)
 _SLIPS = int(Outcome.STANCE_SLIPS)
 _SCUFFS = int(Outcome.SWING_SCUFFS)
-_BEHIND = int(Outcome.FOOT_BEHIND)
-_PULLS = int(Outcome.IMPACT_PULLS)
-_IMPACT_SLIPS = int(Outcome.IMPACT_SLIPS)
-_NO_LIFT = int(Outcome.NO_LIFT_OFF)
-_BODY = int(Outcome.BODY_TOUCHES)
+_BODY = float(Outcome.BODY_TOUCHES)
 _TIME = int(Outcome.TIME_LIMIT)
 _NOT_FINITE = int(Outcome.NOT_FINITE)
-_OPEN = 255  # not yet decided
-_N1, _N2, _N3 = 1.0 / 3.0, 0.6, 6.0 / 7.0  # when the integrator's stages 5, 9 and 10 are
-_NODES = (0.0, _N1, _N2, _N3, 1.0)
-_PER_1, _PER_2, _PER_3 = 1.0 / _N1, 1.0 / _N2, 1.0 / _N3
-_PER_12, _PER_13, _PER_14 = 1.0 / (_N2 - _N1), 1.0 / (_N3 - _N1), 1.0 / (1.0 - _N1)
-_PER_23, _PER_24, _PER_34 = 1.0 / (_N3 - _N2), 1.0 / (1.0 - _N2), 1.0 / (1.0 - _N3)
 
 
 @inner_kernel
@@ -184,19 +168,7 @@ def _of_lane(x, lane):
 
 
 @inner_kernel
-def slopes_ahead(slopes, out):
-    """Sines and cosines of ascending slopes, the steepest up first, the last one LANES times more.
-
-    ``slopes``: rad, shape (m,); ``out``: set, shape (2, m + LANES).
-    """
-    m = slopes.size
-    for i in range(m):
-        out[0, i], out[1, i] = sine_cosine(slopes[m - 1 - i])
-    out[0, m:], out[1, m:] = out[0, m - 1], out[1, m - 1]
-
-
-@inner_kernel
-def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, results):
+def begin(scheme, rob, par, w, v, lane, state, previous, ahead):
     """Put a swing into a lane.
 
     Parameters
@@ -213,17 +185,14 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
         ``[q, dq]`` just after impact, rad and rad/s, shape (10,).
     previous : float
         rad, slope of the ground behind the stance foot.
-    slopes : numpy.ndarray
-        Sines and cosines of the slopes ahead, as `slopes_ahead` puts them, shape (2, m + LANES).
-    outcomes, results : numpy.ndarray
-        Of the lane: codes, shape (m,), and durations (s), lengths (m), energies (J), shape (3, m).
+    ahead : numpy.ndarray
+        The ground ahead of the lane, with the slopes that `slopes_ahead` puts there, shape
+        (AHEAD, m + LANES); what happens on it is put there too.
     """
-    m = outcomes.size
+    m = ahead.shape[1] - LANES
     for i in range(m):
-        outcomes[i] = _OPEN
-        results[0, i] = 0.0
-        results[1, i] = 0.0
-        results[2, i] = 0.0
+        for row in (DURATION, LENGTH, SPENT):
+            ahead[row, i] = 0.0
     for o in (0, 5):
         torso = state[o + 4]
         w[Y, o, lane] = state[o] + torso
@@ -266,11 +235,11 @@ def begin(scheme, rob, par, w, v, lane, state, previous, slopes, outcomes, resul
     if v[FAILURE, lane] >= 0.0:
         return
     back = (v[BACK_SIN, lane], v[BACK_COS, lane])
-    todo = m
-    while todo > 0 and body_touches(rob, s, c, back, (slopes[0, m - todo], slopes[1, m - todo])):
-        todo -= 1
-        outcomes[todo] = _BODY
-    v[TODO, lane] = todo
+    i = 0
+    while i < m and body_touches(rob, s, c, back, (ahead[SINE, i], ahead[COSINE, i])):
+        ahead[OUTCOME, i] = _BODY
+        i += 1
+    v[TODO, lane] = m - i
 
 
 @inner_kernel
@@ -357,7 +326,7 @@ def _choose_slides(par, w, lane, may):
 
 
 @inner_kernel
-def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, trace):
+def advance(scheme, rob, par, w, v, active, ahead, trace):
     """One step of the integrator in all lanes, and what happens in it.
 
     Parameters
@@ -368,11 +337,9 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
         As for `begin`.
     active : numpy.ndarray
         Which lanes hold a swing that has not ended, bool, shape (LANES,); updated.
-    slopes, outcomes, results : numpy.ndarray
-        As for `begin`, for each lane: shape (LANES, 2, m + LANES), (LANES, m),
-        (LANES, 3, m).
-    after : numpy.ndarray
-        States after impact (absolute angles) where the outcome is STEP, shape (LANES, m, 10).
+    ahead : numpy.ndarray
+        The ground ahead of all lanes, as for `begin`, shape (LANES, AHEAD, m + LANES). Where a
+        swing has ended, all is decided, and `to_joint` gives the states after impact.
     trace : numpy.ndarray
         Samples of the swing in lane 0, shape (k, SAMPLE_COLUMNS); k = 0: none are wanted.
     """
@@ -381,7 +348,7 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
         if active[lane]:
             _propose(rob, w, v, lane)
             if v[FAILURE, lane] >= 0.0 or v[TODO, lane] == 0.0:
-                _end(v, lane, outcomes[lane], results[lane])
+                _end(rob, v, lane, ahead[lane])
                 active[lane] = False
     if not active.any():
         return
@@ -390,27 +357,14 @@ def advance(scheme, rob, par, w, v, active, slopes, outcomes, results, after, tr
     for lane in range(LANES):
         if active[lane]:
             v[EVALUATIONS, lane] += STAGES
-            m = outcomes.shape[1]
-            if _inspect(scheme, rob, par, w, v, lane, slopes[lane], m) or trace.shape[0] > 0:
+            if _inspect(scheme, rob, par, w, v, lane, ahead[lane]) or trace.shape[0] > 0:
                 v[EVALUATIONS, lane] += DENSE_STAGES
                 dense = True
     if dense:
         prepare_dense(scheme, rob, par, w)
     for lane in range(LANES):
         if w[MODE, GOOD, lane] != 0.0:
-            _finish(
-                scheme,
-                rob,
-                par,
-                w,
-                v,
-                lane,
-                slopes[lane],
-                outcomes[lane],
-                results[lane],
-                after[lane],
-                trace,
-            )
+            _finish(scheme, rob, par, w, v, lane, ahead[lane], trace)
     take_step(w)
     if v[RESTARTS].any():
         _restart(scheme, rob, par, w, v)
@@ -428,16 +382,20 @@ def _propose(rob, w, v, lane):
 
 
 @inner_kernel
-def _end(v, lane, outcomes, results):
-    """The slopes that are still open share the failure that ended the swing."""
-    for i in range(int(v[TODO, lane])):
-        outcomes[i] = int(v[FAILURE, lane])
-        results[0, i] = v[TIME, lane]
-        results[2, i] = v[ENERGY, lane]
+def _end(rob, v, lane, ahead):
+    """Decide the rest: slopes that are still open share the failure that ended the swing."""
+    m = ahead.shape[1] - LANES
+    landed = m - int(v[TODO, lane])
+    impacts(rob, ahead, landed)
+    for i in range(landed, m):
+        ahead[OUTCOME, i] = v[FAILURE, lane]
+        ahead[DURATION, i] = v[TIME, lane]
+        ahead[LENGTH, i] = 0.0
+        ahead[SPENT, i] = v[ENERGY, lane]
 
 
 @inner_kernel
-def _inspect(scheme, rob, par, w, v, lane, slopes, m):
+def _inspect(scheme, rob, par, w, v, lane, ahead):
     """Whether the step just tried is good, and whether something may happen in it.
 
     Returns whether its dense output is needed to find out.
@@ -465,8 +423,8 @@ def _inspect(scheme, rob, par, w, v, lane, slopes, m):
     s, c = lane_angles(w, END, lane), lane_rates(w, END, lane)  # where its sines and cosines stand
     x, y, dx, dy = foot(rob, s, c, lane_rates(w, Y_NEW, lane))
     v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane] = x, y, dx, dy
-    i = m - int(v[TODO, lane])
-    slope = (slopes[0, i], slopes[1, i])
+    i = ahead.shape[1] - LANES - int(v[TODO, lane])
+    slope = (ahead[SINE, i], ahead[COSINE, i])
     back = (v[BACK_SIN, lane], v[BACK_COS, lane])
     near = body_touches(rob, s, c, back, slope)
     if v[FOOT_X, lane] < 0.0:
@@ -493,10 +451,10 @@ def _may_reach(v, lane, nx, ny, h):
 
 
 @inner_kernel
-def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trace):
+def _finish(scheme, rob, par, w, v, lane, ahead, trace):
     """What happens in a step that is good, and the start of the next one."""
     h, t = w[MODE, H, lane], v[TIME, lane]
-    _find_lobes(w, lane)
+    find_lobes(w, lane)
 
     # The step ends early where a torque reaches or leaves its limit, or the controller switches.
     end, joint, held, switches = 1.0, -1, 0.0, False
@@ -525,22 +483,20 @@ def _finish(scheme, rob, par, w, v, lane, slopes, outcomes, results, after, trac
     if v[SLIPS, lane] != 0.0:
         stop, failure = _first_fall(scheme, rob, par, w, v, lane, end, h)
     if v[NEAR, lane] != 0.0:
-        stop, failure = _ground(
-            rob, w, v, lane, slopes, outcomes, results, after, end, stop, failure
-        )
+        stop, failure = meet_ground(rob, w, v, lane, ahead, end, stop, failure)
     if trace.shape[0] > 0 and lane == 0:
         until = stop
         if v[TODO, lane] == 0.0:
-            until = min(stop, (results[0, 0] - t) / h)
+            until = min(stop, (ahead[DURATION, 0] - t) / h)
         _sample(scheme, rob, par, w, v, trace, until)
     if failure >= 0:
         w[MODE, GOOD, lane] = 0.0
         v[FAILURE, lane] = failure
-        v[ENERGY, lane] = lane_of(_energy(w, v, lane, splat(stop)), 0)
+        v[ENERGY, lane] = lane_of(energy_at(w, v, lane, splat(stop)), 0)
         v[TIME, lane] = t + stop * h
         return
 
-    v[ENERGY, lane] = _energy_at_end(w, v, lane, end)
+    v[ENERGY, lane] = energy_at_end(w, v, lane, end)
     v[TIME, lane] = t + end * h
     v[FOOT_X, lane], v[FOOT_Y, lane] = v[END_X, lane], v[END_Y, lane]
     v[FOOT_DX, lane], v[FOOT_DY, lane] = v[END_DX, lane], v[END_DY, lane]
@@ -645,289 +601,6 @@ def _first_fall(scheme, rob, par, w, v, lane, end, h):
 
 
 @inner_kernel
-def _ground(rob, w, v, lane, slopes, outcomes, results, after, end, stop, failure):
-    """Where the swing foot and the body meet the ground before ``stop``.
-
-    Decides the slopes that are reached, and returns where the step stops and the outcome of all
-    others, which is ``failure`` if the foot does not come down behind.
-    """
-    h = w[MODE, H, lane]
-    parts = min(FOOT_PARTS, int(end * h / _FOOT_INTERVAL) + 1)
-    place_feet(rob, w, lane, end, parts)
-    at_start = (v[FOOT_X, lane], v[FOOT_Y, lane], v[FOOT_DX, lane], v[FOOT_DY, lane])
-    at_end = (v[END_X, lane], v[END_Y, lane], v[END_DX, lane], v[END_DY, lane])
-    back = (v[BACK_SIN, lane], v[BACK_COS, lane])
-    low, at_low = 0.0, at_start  # the foot is ahead of the stance foot from low to high
-    high = end
-    if at_start[0] < 0.0:
-        low, at_low = end, at_end
-        if at_end[0] >= 0.0:
-            low = _passing(rob, w, lane, -1.0, at_start, at_end, end, h)
-            at_low = foot_once(rob, w, lane, low)
-        # Behind the stance foot: against the ground of the preceding slope.
-        nx, ny = splat(-back[0]), splat(back[1])
-        _, _, guess = first_below(
-            rob, w, lane, nx, ny, v[LOWEST, lane], 0.0, at_start, low, at_low, end, parts, h
-        )
-        touch = lane_of(guess, 0)
-        if touch > 1.0 and at_end[0] >= 0.0 and not at_low[1] > 0.0:
-            touch = low
-        if touch <= stop:
-            stop = touch
-            failure = _BEHIND if v[PASSED, lane] != 0.0 else _SCUFFS
-        if at_end[0] >= 0.0:
-            v[PASSED, lane] = 1.0
-    elif at_end[0] < 0.0:
-        high = _passing(rob, w, lane, 1.0, at_start, at_end, end, h)
-    high = min(stop, high)
-    at_high = at_end if high == end else foot_once(rob, w, lane, high)
-
-    # Slopes that the foot reaches in this step, the steepest first, some at once. Each is decided
-    # by itself, so that its outcome does not depend on the others.
-    m = outcomes.size
-    todo = int(v[TODO, lane])
-    reached = LANES
-    while reached == LANES and todo > 0 and low < high:
-        sine, cosine = load_from(slopes, 0, m - todo), load_from(slopes, 1, m - todo)
-        before, until, guess = first_below(
-            rob, w, lane, -sine, cosine, 0.0, low, at_low, high, at_high, end, parts, h
-        )
-        store(w, PLACES, AT, guess)
-        reached = 0
-        while reached < min(LANES, todo) and w[PLACES, AT, reached] <= 1.0:
-            reached += 1
-        if reached == 0:
-            break
-        _land(rob, w, v, lane, sine, cosine, before, until, guess, back, h)
-        for k in range(reached):
-            todo -= 1
-            at = w[PLACES, AT, k]
-            if w[PLACES, TOUCHES, k] != 0.0:
-                outcomes[todo] = _BODY
-                slope = (slopes[0, m - 1 - todo], slopes[1, m - 1 - todo])
-                at = body_root(rob, w, lane, back, slope, at)
-                results[2, todo] = lane_of(_energy(w, v, lane, splat(at)), 0)
-            else:
-                slope = (slopes[0, m - 1 - todo], slopes[1, m - 1 - todo])
-                outcomes[todo] = _outcome(rob, w, k, slope)
-                results[2, todo] = w[PLACES, ENERGY_AT, k]
-                if outcomes[todo] == _STEP:
-                    results[1, todo] = math.sqrt(w[PLACES, LENGTH, k])
-                    for i in range(10):
-                        after[todo, i] = w[IMPACTS, i, k]
-            results[0, todo] = v[TIME, lane] + at * h
-    # Slopes that the body reaches before the foot.
-    while todo > 0:
-        slope = (slopes[0, m - todo], slopes[1, m - todo])
-        if stop == end:
-            s, c = lane_angles(w, END, lane), lane_rates(w, END, lane)
-            touches = body_touches(rob, s, c, back, slope)
-        else:
-            touches = body_touches_at(rob, w, lane, stop, back, slope)
-        if not touches:
-            break
-        todo -= 1
-        at = body_root(rob, w, lane, back, slope, stop)
-        outcomes[todo] = _BODY
-        results[0, todo] = v[TIME, lane] + at * h
-        results[2, todo] = lane_of(_energy(w, v, lane, splat(at)), 0)
-    v[TODO, lane] = todo
-    return stop, failure
-
-
-@inner_kernel
-def _passing(rob, w, lane, side, at_start, at_end, end, h):
-    """When the swing foot passes the stance foot, from ``side`` of it (1: from ahead)."""
-    f0, f1 = side * at_start[0], side * at_end[0]
-    d0, d1 = side * at_start[2] * end * h, side * at_end[2] * end * h
-    return root_once(rob, w, lane, side, 0.0, 0.0, end, end * cubic_root(f0, d0, f1, d1), h)
-
-
-@inner_kernel
-def _land(rob, w, v, lane, sine, cosine, low, high, guess, back, h):
-    """Impacts on several slopes at once, where ``guess`` is at most 1; sets PLACES and IMPACTS."""
-    searching = guess <= 1.0
-    at, away, a, da, s, c, _, _ = foot_root(
-        rob, w, lane, -sine, cosine, low, high, select(searching, guess, 0.5), searching, h
-    )
-    # There by first order: the motion is not evaluated again.
-    a, da, s, c = _moved(w, lane, at, away, a, da, s, c, h)
-    at = at + away
-    x, y, _, _ = foot(rob, s, c, da)
-    touches = body_touches(rob, s, c, (splat(back[0]), splat(back[1])), (sine, cosine))
-    new_rates, px, py, vx, vy = impact.impact(rob, s, c, da)
-    new = impact.swapped(a)
-    # Not finite as soon as one of them is not.
-    check = 0.0 * at
-    for i in range(5):
-        store(w, IMPACTS, i, new[i])
-        store(w, IMPACTS, 5 + i, new_rates[i])
-        check = check + 0.0 * new[i]
-        check = check + 0.0 * new_rates[i]
-    store(w, IMPACTS, 10, px)
-    store(w, IMPACTS, 11, py)
-    store(w, IMPACTS, 12, vx)
-    store(w, IMPACTS, 13, vy)
-    store(w, PLACES, AT, at)
-    store(w, PLACES, VALUE, check)
-    store(w, PLACES, TOUCHES, select(touches, 1.0, 0.0 * at))
-    store(w, PLACES, LENGTH, x * x + y * y)
-    store(w, PLACES, ENERGY_AT, _energy(w, v, lane, at))
-
-
-@inner_kernel
-def _moved(w, lane, at, away, a, da, s, c, h):
-    """Angles, rates, sines and cosines a little ``away`` from where they are, at ``at``."""
-    t = away * h
-    d = (t * da[0], t * da[1], t * da[2], t * da[3], t * da[4])
-    return (
-        (a[0] + d[0], a[1] + d[1], a[2] + d[2], a[3] + d[3], a[4] + d[4]),
-        (
-            da[0] + away * interpolated_slope(w, lane, 5, at),
-            da[1] + away * interpolated_slope(w, lane, 6, at),
-            da[2] + away * interpolated_slope(w, lane, 7, at),
-            da[3] + away * interpolated_slope(w, lane, 8, at),
-            da[4] + away * interpolated_slope(w, lane, 9, at),
-        ),
-        (
-            s[0] + d[0] * c[0],
-            s[1] + d[1] * c[1],
-            s[2] + d[2] * c[2],
-            s[3] + d[3] * c[3],
-            s[4] + d[4] * c[4],
-        ),
-        (
-            c[0] - d[0] * s[0],
-            c[1] - d[1] * s[1],
-            c[2] - d[2] * s[2],
-            c[3] - d[3] * s[3],
-            c[4] - d[4] * s[4],
-        ),
-    )
-
-
-@inner_kernel
-def _outcome(rob, w, place, slope):
-    """Outcome of an impact in the rows IMPACTS and PLACES."""
-    sine, cosine = slope
-    px, py = w[IMPACTS, 10, place], w[IMPACTS, 11, place]
-    vx, vy = w[IMPACTS, 12, place], w[IMPACTS, 13, place]
-    normal = py * cosine - px * sine
-    tangential = px * cosine + py * sine
-    if w[PLACES, VALUE, place] != 0.0:  # it is not a number
-        return _NOT_FINITE
-    if not normal > 0.0:
-        return _PULLS
-    if rob[r.VERTICAL_FRICTION] != 0.0:
-        sticks = abs(px) < rob[r.FRICTION] * py
-    else:
-        sticks = abs(tangential) < rob[r.FRICTION] * normal
-    if not sticks:
-        return _IMPACT_SLIPS
-    if not vy * cosine - vx * sine > 0.0:
-        return _NO_LIFT
-    return _STEP
-
-
-@inner_kernel
-def to_joint(absolute, state):
-    """Absolute angles and rates as a state ``[q, dq]``."""
-    for o in (0, 5):
-        torso = absolute[o + 4]
-        state[o] = absolute[o] - torso
-        state[o + 1] = absolute[o + 1] - torso
-        state[o + 2] = absolute[o + 2] - absolute[o]
-        state[o + 3] = absolute[o + 3] - absolute[o + 1]
-        state[o + 4] = torso
-
-
-@inner_kernel
-def _find_lobes(w, lane):
-    """Find where the power of a joint changes its sign, and the joint's work up to there.
-
-    The energy is the integral of the power's magnitude, which has a kink there. The powers at five
-    stages give a polynomial; it is needed up to the kinks only, where its error matters little.
-    """
-    h = w[MODE, H, lane]
-    for i in range(4):
-        row = LOBE + i
-        w[row, 0, lane] = 2.0
-        if w[ESTIMATE, TURNS + i, lane] < 0.0:
-            column = WORK + i
-            p0, p1 = w[STAGE, column, lane], w[STAGE + 5, column, lane]
-            p2, p3 = w[STAGE + 9, column, lane], w[STAGE + 10, column, lane]
-            p4 = w[STAGE + STAGES, column, lane]
-            # Newton's divided differences on the nodes, then powers of the fraction.
-            d1 = (p1 - p0) * _PER_1
-            e2 = (p2 - p1) * _PER_12
-            e3 = (p3 - p2) * _PER_23
-            e4 = (p4 - p3) * _PER_34
-            d2 = (e2 - d1) * _PER_2
-            f3 = (e3 - e2) * _PER_13
-            f4 = (e4 - e3) * _PER_24
-            d3 = (f3 - d2) * _PER_3
-            d4 = (f4 - f3) * _PER_14 - d3
-            b3 = d3 - d4 * (_N1 + _N2 + _N3)
-            b2 = d2 - d3 * (_N1 + _N2) + d4 * (_N1 * _N2 + _N1 * _N3 + _N2 * _N3)
-            b1 = d1 - d2 * _N1 + d3 * _N1 * _N2 - d4 * _N1 * _N2 * _N3
-            found = 0
-            for k in range(4):
-                low, before = _NODES[k], (p0, p1, p2, p3)[k]
-                high, after = _NODES[k + 1], (p1, p2, p3, p4)[k]
-                if before * after < 0.0:
-                    at = low + (high - low) * before / (before - after)
-                    # The work changes with the square of what the place is off.
-                    for _ in range(2):
-                        value = p0 + at * (b1 + at * (b2 + at * (b3 + at * d4)))
-                        if (value > 0.0) == (before > 0.0):
-                            low = at
-                        else:
-                            high = at
-                        slope = b1 + at * (2.0 * b2 + at * (3.0 * b3 + at * 4.0 * d4))
-                        at -= value / slope
-                        if not low < at < high:
-                            at = 0.5 * (low + high)
-                    work = p0 + at * (0.5 * b1 + at * (_N1 * b2 + at * (0.25 * b3 + at * 0.2 * d4)))
-                    w[row, found, lane] = at
-                    w[row, 4 + found, lane] = h * at * work
-                    found += 1
-            if found < 4:
-                w[row, found, lane] = 2.0
-
-
-@inner_kernel
-def _energy(w, v, lane, at):
-    """Energy spent up to fractions of the step in lanes, J (eq. 36)."""
-    total = splat(v[ENERGY, lane])
-    for i in range(4):
-        row = LOBE + i
-        last = 0.0 * at
-        for k in range(4):
-            if w[row, k, lane] > 1.0:
-                break
-            passed = w[row, k, lane] < at
-            total = total + select(passed, abs(w[row, 4 + k, lane] - last), 0.0)
-            last = select(passed, w[row, 4 + k, lane], last)
-        total = total + abs(interpolate(w, lane, WORK + i, at) - last)
-    return total
-
-
-@inner_kernel
-def _energy_at_end(w, v, lane, end):
-    """The same at the end of the step, with its works in row Y_NEW."""
-    total = v[ENERGY, lane]
-    for i in range(4):
-        last = 0.0
-        for k in range(4):
-            if w[LOBE + i, k, lane] >= end:
-                break
-            total += abs(w[LOBE + i, 4 + k, lane] - last)
-            last = w[LOBE + i, 4 + k, lane]
-        total += abs(w[Y_NEW, WORK + i, lane] - last)
-    return total
-
-
-@inner_kernel
 def _sample(scheme, rob, par, w, v, trace, until):
     """Samples of lane 0 up to a fraction of the step, into the trace."""
     samples = int(v[SAMPLES, 0])
@@ -945,6 +618,6 @@ def _sample(scheme, rob, par, w, v, trace, until):
                 trace[samples, 11 + i] = lane_of(applied[i], 0)
             trace[samples, 15] = lane_of(force[0], 0)
             trace[samples, 16] = lane_of(force[1], 0)
-            trace[samples, 17] = lane_of(_energy(w, v, 0, at), 0)
+            trace[samples, 17] = lane_of(energy_at(w, v, 0, at), 0)
             samples += 1
     v[SAMPLES, 0] = samples

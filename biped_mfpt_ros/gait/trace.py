@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
-from biped_mfpt_ros.gait.scratch import SAMPLES, VARIABLES, empty_scratch
+from biped_mfpt_ros.gait.ground import slopes_ahead, to_joint
+from biped_mfpt_ros.gait.scratch import AHEAD, OUTCOME, SAMPLES, VARIABLES, empty_scratch
 from biped_mfpt_ros.gait.step import check_states
-from biped_mfpt_ros.gait.swing import SAMPLE_COLUMNS, advance, begin, slopes_ahead
+from biped_mfpt_ros.gait.swing import SAMPLE_COLUMNS, advance, begin
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker import dynamics
@@ -26,16 +27,14 @@ def _traced(scheme, rob, par, state, previous, slope, next_state, samples):
     """Simulate one swing in lane 0; returns the outcome and how many samples were taken."""
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
     active = np.zeros(LANES, np.bool_)
-    outcomes, results = np.zeros((LANES, 1), np.uint8), np.zeros((LANES, 3, 1))
-    after = np.zeros((LANES, 1, STATE_SIZE))
-    ground = np.empty((LANES, 2, 1 + LANES))
-    slopes_ahead(np.array([slope]), ground[0])
-    begin(scheme, rob, par, w, v, 0, state, previous, ground[0], outcomes[0], results[0])
+    ahead = np.zeros((LANES, AHEAD, 1 + LANES))
+    slopes_ahead(np.array([slope]), ahead[0])
+    begin(scheme, rob, par, w, v, 0, state, previous, ahead[0])
     active[0] = True
     while active[0]:
-        advance(scheme, rob, par, w, v, active, ground, outcomes, results, after, samples)
-    next_state[:] = after[0, 0]
-    return outcomes[0, 0], int(v[SAMPLES, 0])
+        advance(scheme, rob, par, w, v, active, ahead, samples)
+    to_joint(ahead[0], 0, next_state)
+    return int(ahead[0, OUTCOME, 0]), int(v[SAMPLES, 0])
 
 
 @dataclass(frozen=True)
@@ -123,5 +122,5 @@ def trace_swing(
         forces=samples[:, 15:17],
         energies=samples[:, 17],
         outcome=outcome,
-        next_state=dynamics.to_joint(after) if outcome == Outcome.STEP else None,
+        next_state=after if outcome == Outcome.STEP else None,
     )
