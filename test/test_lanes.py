@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.lanes import LANES, load, negated_if_odd, store
+from biped_mfpt_ros.lanes import LANES, load, load_from, negated_if_odd, store, store_into
 
 RNG = np.random.default_rng(5)
 
@@ -70,3 +71,19 @@ def test_negated_if_odd(offset):
     expected = -w[0, 0] if offset % 2 else w[0, 0]
     assert w[1, 0].tobytes() == expected.tobytes()
     assert alone == expected[0] == negated_if_odd(w[0, 0, 0], w[0, 1, 0])
+
+
+@kernel
+def _roots(table, first):
+    store_into(table, 1, first, math.sqrt(load_from(table, 0, first)))
+
+
+def test_lanes_from_anywhere_in_a_row():
+    table = np.zeros((2, 3 * LANES))
+    table[0] = RNG.uniform(0, 10, 3 * LANES)
+    for first in (0, 1, LANES + 1, 2 * LANES):
+        table[1] = -1.0
+        _roots(table, first)
+        inside = slice(first, first + LANES)
+        assert np.array_equal(table[1, inside], np.sqrt(table[0, inside]))
+        assert (table[1] == -1.0).sum() == 2 * LANES

@@ -140,4 +140,3 @@ def test_bad_input_over_ros_is_taken_or_refused_clearly():
         assert row.failures == 0, (row.what, *row.examples)
     refused = sum(row.facts.get("refused", 0) for row in rows)
     assert 0.1 * live.SHORT_INPUTS < refused < 0.9 * live.SHORT_INPUTS
-

@@ -23,7 +23,7 @@ from biped_mfpt_ros.control.controller import (
     paper_controller_names,
 )
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.gait import integrate, swing
+from biped_mfpt_ros.gait import energy, integrate
 from biped_mfpt_ros.gait.closed_loop import closed_loop
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.scratch import empty_scratch
@@ -87,7 +87,7 @@ def test_coefficients_of_the_integrator():
     assert np.allclose(integrate._ERROR_3, DOP853.E3[:12], rtol=1e-14, atol=0)
     assert np.allclose(integrate._DENSE, DOP853.D, rtol=1e-14, atol=0)
     nodes = [0.0, DOP853.C[5], DOP853.C[9], DOP853.C[10], 1.0]
-    assert np.allclose(swing._NODES, nodes, rtol=1e-14, atol=0)
+    assert np.allclose(energy._NODES, nodes, rtol=1e-14, atol=0)
 
 
 def test_a_swing_agrees_with_scipy():
@@ -215,6 +215,30 @@ def test_without_torque_late_in_the_step_base_walks_down_nine_degrees():
         result = simulate_steps(control, [state], [down], [down], model)
         assert result.outcomes[0, 0] == Outcome.STEP
         state = result.next_states[0]
+
+
+def test_a_foot_that_comes_down_behind_stands_on_the_ground():
+    """To 1e-9 m beyond what it may be below: impacts are found to 1e-12 s."""
+    control, states, previous = reachable("hzd/cot", 1)
+    rng = np.random.default_rng(2)
+    states = np.tile(states, (20, 1)) * (1.0 + 0.05 * rng.standard_normal((20 * len(states), 10)))
+    previous = np.tile(previous, 20)
+    steps = simulate_steps(control, states, previous, [0.0])
+    seen = 0
+    for k in np.nonzero(steps.outcomes[:, 0] == Outcome.SWING_SCUFFS)[0]:
+        trace = trace_swing(control, states[k], previous[k], 0.0)
+        if steps.durations[k, 0] == 0.0:
+            continue
+        start, end = (
+            dynamics.swing_foot(WalkerModel().packed(), dynamics.to_absolute(state))
+            for state in (trace.states[0], trace.states[-1])
+        )
+        along = np.array([-math.sin(previous[k]), math.cos(previous[k])])
+        lowest = min(0.0, float(along @ start[:2]))
+        assert trace.times[-1] == pytest.approx(steps.durations[k, 0], abs=1e-12)
+        assert float(along @ end[:2]) == pytest.approx(lowest - 1e-9, abs=1e-9)
+        seen += 1
+    assert seen > 20
 
 
 def test_every_outcome_occurs():

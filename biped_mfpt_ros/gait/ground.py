@@ -115,12 +115,15 @@ def meet_ground(rob, w, v, lane, ahead, end, stop, failure):
             low = _passing(rob, w, lane, -1.0, at_start, at_end, end, h)
             at_low = _foot_once(rob, w, lane, low)
         # Behind the stance foot: against the ground of the preceding slope.
-        nx, ny = splat(-back[0]), splat(back[1])
-        _, _, guess = _first_below(
-            rob, w, lane, nx, ny, v[LOWEST, lane], 0.0, at_start, low, at_low, end, parts, h
+        nx, ny, lowest = -back[0], back[1], v[LOWEST, lane]
+        before, after, guess = _first_below(
+            rob, w, lane, splat(nx), splat(ny), lowest, 0.0, at_start, low, at_low, end, parts, h
         )
         touch = lane_of(guess, 0)
-        if touch > 1.0 and at_end[0] >= 0.0 and not at_low[1] > 0.0:
+        if touch <= 1.0:
+            first, last = lane_of(before, 0), lane_of(after, 0)
+            touch = _root_once(rob, w, lane, nx, ny, lowest, first, last, touch, h)
+        elif at_end[0] >= 0.0 and not at_low[1] > 0.0:
             touch = low
         if touch <= stop:
             stop = touch
@@ -171,7 +174,8 @@ def _passing(rob, w, lane, side, at_start, at_end, end, h):
     """When the swing foot passes the stance foot, from ``side`` of it (1: from ahead)."""
     f0, f1 = side * at_start[0], side * at_end[0]
     d0, d1 = side * at_start[2] * end * h, side * at_end[2] * end * h
-    return _root_once(rob, w, lane, side, 0.0, 0.0, end, end * _cubic_root(f0, d0, f1, d1), h)
+    guess = end * _cubic_root(f0, d0, f1, d1)
+    return _root_once(rob, w, lane, side, 0.0, 0.0, 0.0, end, guess, h)
 
 
 @inner_kernel
@@ -193,7 +197,9 @@ def _land(rob, w, v, lane, ahead, i, low, high, guess, h):
     sine, cosine = load_from(ahead, SINE, i), load_from(ahead, COSINE, i)
     searching = guess <= 1.0
     guess = select(searching, guess, 0.5)
-    at, away, a, da, s, c = _foot_root(rob, w, lane, -sine, cosine, low, high, guess, searching, h)
+    at, away, a, da, s, c = _foot_root(
+        rob, w, lane, -sine, cosine, 0.0, low, high, guess, searching, h
+    )
     # There by first order: the motion is not evaluated again.
     a, da, s, c = _moved(w, lane, at, away, a, da, s, c, h)
     at = at + away
@@ -277,11 +283,11 @@ def _cubic_root(f0, d0, f1, d1):
 
 
 @inner_kernel
-def _foot_root(rob, w, lane, nx, ny, low, high, at, searching, span):
-    """Where ``nx x + ny y`` of the swing foot falls through zero, in lanes, by a guarded Newton.
+def _foot_root(rob, w, lane, nx, ny, offset, low, high, at, searching, span):
+    """Where the swing foot falls through ``nx x + ny y = offset``, in lanes, by a guarded Newton.
 
-    ``low`` and ``high`` are fractions of the step, of ``span`` seconds, with a positive value at
-    ``low`` and one not above zero at ``high``; ``at`` is a guess. Not all lanes need be searched.
+    ``low`` and ``high`` are fractions of the step, of ``span`` seconds, with the foot above at
+    ``low`` and not above at ``high``; ``at`` is a guess. Not all lanes need be searched.
 
     Returns
     -------
@@ -294,7 +300,7 @@ def _foot_root(rob, w, lane, nx, ny, low, high, at, searching, span):
     x, y, dx, dy = foot(rob, s, c, da)
     away = 0.0 * at
     for _ in range(100):
-        value = nx * x + ny * y
+        value = nx * x + ny * y - offset
         above = value > 0.0
         low = select(above, at, low)
         high = select(above, high, at)
@@ -315,11 +321,11 @@ def _foot_root(rob, w, lane, nx, ny, low, high, at, searching, span):
 
 
 @inner_kernel
-def _root_once(rob, w, lane, nx, ny, low, high, at, span):
+def _root_once(rob, w, lane, nx, ny, offset, low, high, at, span):
     """The same for one, as a number."""
     one = splat(at)
     found, away, _, _, _, _ = _foot_root(
-        rob, w, lane, splat(nx), splat(ny), splat(low), splat(high), one, one == one, span
+        rob, w, lane, splat(nx), splat(ny), offset, splat(low), splat(high), one, one == one, span
     )
     return lane_of(found + away, 0)
 

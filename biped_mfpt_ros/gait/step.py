@@ -79,13 +79,13 @@ def _simulate(
                 of[lane] = -1
                 costs[k, 0], costs[k, 1] = int(v[STEPS, lane]), int(v[EVALUATIONS, lane])
                 for i in range(m):
-                    j = m - 1 - i
-                    outcomes[k, i] = int(ahead[lane, OUTCOME, j])
-                    durations[k, i] = ahead[lane, DURATION, j]
-                    lengths[k, i] = ahead[lane, LENGTH, j]
-                    energies[k, i] = ahead[lane, SPENT, j]
+                    durations[k, i] = ahead[lane, DURATION, m - 1 - i]
+                    lengths[k, i] = ahead[lane, LENGTH, m - 1 - i]
+                    energies[k, i] = ahead[lane, SPENT, m - 1 - i]
+                for i in range(m):
+                    outcomes[k, i] = int(ahead[lane, OUTCOME, m - 1 - i])
                     if outcomes[k, i] == _STEP:
-                        to_joint(ahead[lane], j, following[k * m + i])
+                        to_joint(ahead[lane], m - 1 - i, following[k * m + i])
             if started < n and evaluations + v[EVALUATIONS].sum() < most_evaluations:
                 evaluations += int(v[EVALUATIONS, lane])
                 begin(
