@@ -32,7 +32,7 @@ from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
 
-_SWINGS = 64  # of a batch that is timed
+_SWINGS = 1024  # of a batch that is timed
 _RIGID_STEP = 1e-3  # s
 
 
@@ -71,7 +71,7 @@ def step_map(name: str, repetitions: int) -> tuple[list[dict[str, Any]], dict[st
     """One swing for all 81 slopes, with a check against a tolerance of 1e-12."""
     control, model = controller(name), readings()[name].model
     _, states, previous = reached(control, model)
-    # As many as in a chunk of a mesh, so that all lanes are busy.
+    # About as many as in a request of a large mesh: lanes are idle only as a batch ends.
     copies = 1 + _SWINGS // len(states)
     states, previous = np.tile(states, (copies, 1)), np.tile(previous, copies)
 
