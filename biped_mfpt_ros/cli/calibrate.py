@@ -150,8 +150,7 @@ def _text(fits: list[Fit], judged: dict[str, Judged]) -> str:
     ]
     if claims:
         parts.append(
-            "READINGS THAT BREAK WHAT THE PAPER CLAIMS\n\n"
-            + table(("", "models", "what"), claims)
+            "READINGS THAT BREAK WHAT THE PAPER CLAIMS\n\n" + table(("", "models", "what"), claims)
         )
     parts.append(
         "Differences are ours less the paper's. A residual ln(ours / paper) counts in units of "
@@ -163,9 +162,7 @@ def _text(fits: list[Fit], judged: dict[str, Judged]) -> str:
     return "\n\n\n".join(parts)
 
 
-def _report(
-    fits: list[Fit], judged: dict[str, Judged], args: argparse.Namespace
-) -> dict[str, Any]:
+def _report(fits: list[Fit], judged: dict[str, Judged], args: argparse.Namespace) -> dict[str, Any]:
     return {
         "walks": args.walks,
         "seed": args.seed,

@@ -350,9 +350,7 @@ def _published_deg(study: _Study) -> list[float]:
     return sorted({s for n in study.plan.controllers for s in SIGMA_DEG[scheme_of(n)]})
 
 
-def _wait_for_estimates(
-    study: _Study, job: Job, client: Any, mesh_id: str, recorder: Any
-) -> None:
+def _wait_for_estimates(study: _Study, job: Job, client: Any, mesh_id: str, recorder: Any) -> None:
     """Wait until a recorder has what the analysis publishes of a mesh."""
     sigmas = [options.spread("sigma", degrees) for degrees in _published_deg(study)]
     study.show(job, "waiting for the analysis")

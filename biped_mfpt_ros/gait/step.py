@@ -50,14 +50,14 @@ def _simulate(
     durations,
     lengths,
     energies,
-    following,
 ):
-    """Simulate a swing from every state; the states after impact are packed into ``following``.
+    """Simulate a swing from every state.
 
     A lane that has ended its swing takes the next state. No swing is begun after
     ``most_evaluations``; those are dropped that only begun since they were under way at once, so
     that what is left does not depend on the number of lanes. Returns how many states were
-    simulated, how many steps succeeded, integrator steps and evaluations.
+    simulated, states after impact of the steps that succeeded, in order, integrator steps and
+    evaluations.
     """
     n, m = outcomes.shape
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
@@ -69,6 +69,9 @@ def _simulate(
     trace = np.zeros((0, 0))
     started = 0
     costs = np.zeros((n, 2), np.int64)  # integrator steps and evaluations
+    # States after impact as swings end, and where those of each state begin.
+    found, at = np.empty((n * m, STATE_SIZE)), np.zeros(n, np.int64)
+    count = 0
     evaluations = 0
     while True:
         for lane in range(LANES):
@@ -82,10 +85,12 @@ def _simulate(
                     durations[k, i] = ahead[lane, DURATION, m - 1 - i]
                     lengths[k, i] = ahead[lane, LENGTH, m - 1 - i]
                     energies[k, i] = ahead[lane, SPENT, m - 1 - i]
+                at[k] = count
                 for i in range(m):
                     outcomes[k, i] = int(ahead[lane, OUTCOME, m - 1 - i])
                     if outcomes[k, i] == _STEP:
-                        to_joint(ahead[lane], m - 1 - i, following[k * m + i])
+                        to_joint(ahead[lane], m - 1 - i, found[count])
+                        count += 1
             if started < n and evaluations + v[EVALUATIONS].sum() < most_evaluations:
                 evaluations += int(v[EVALUATIONS, lane])
                 begin(
@@ -104,17 +109,18 @@ def _simulate(
         if not active.any():
             break
         advance(scheme, rob, par, w, v, active, ahead, trace)
-    count = done = steps = evaluations = 0
+    done = steps = evaluations = 0
     while done < started and (done == 0 or evaluations < most_evaluations):
         steps += costs[done, 0]
         evaluations += costs[done, 1]
         done += 1
+    following = np.empty(((outcomes[:done] == _STEP).sum(), STATE_SIZE))
+    count = 0
     for k in range(done):
-        for i in range(m):
-            if outcomes[k, i] == _STEP:
-                following[count] = following[k * m + i]
-                count += 1
-    return done, count, steps, evaluations
+        of_state = (outcomes[k] == _STEP).sum()
+        following[count : count + of_state] = found[at[k] : at[k] + of_state]
+        count += of_state
+    return done, following, steps, evaluations
 
 
 @dataclass(frozen=True)
@@ -217,9 +223,8 @@ def simulate_steps(
     packed_model, packed_controller = model.packed(), controller.packed(model.robot)
     outcomes = np.empty((n, m), dtype=np.uint8)
     durations, lengths, energies = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
-    following = np.empty((n * m, STATE_SIZE))
     start = time.perf_counter()
-    done, count, steps, evaluations = _simulate(
+    done, following, steps, evaluations = _simulate(
         controller.code,
         packed_model,
         packed_controller,
@@ -231,12 +236,11 @@ def simulate_steps(
         durations,
         lengths,
         energies,
-        following,
     )
     seconds = time.perf_counter() - start
     return Steps(
         outcomes=outcomes[:done],
-        next_states=following[:count].copy(),
+        next_states=following,
         durations=durations[:done],
         step_lengths=lengths[:done],
         energies=energies[:done],

@@ -219,9 +219,7 @@ class WalkerModel:
         """Check every value."""
         _check("torque_limit", self.torque_limit, self.torque_limit > 0.0, "> 0 N m, inf for none")
         _check("friction", self.friction, self.friction > 0.0, "> 0, inf for no slip")
-        _check(
-            "slip_duration", self.slip_duration, 0.0 <= self.slip_duration <= 1.0, "0 to 1 s"
-        )
+        _check("slip_duration", self.slip_duration, 0.0 <= self.slip_duration <= 1.0, "0 to 1 s")
         _check("time_limit", self.time_limit, 0.0 < self.time_limit <= 60.0, "above 0, to 60 s")
         _check("tolerance", self.tolerance, 1e-13 <= self.tolerance <= 1e-2, "1e-13 to 1e-2")
         if self.friction_frame not in FRICTION_FRAMES:
