@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.jit import inner_kernel
+from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import ABSOLUTE, Robot, rabbit
 
@@ -31,7 +31,7 @@ _KP, _KD, _THETA_START, _SLOPE, _OFF, _MONOMIAL = 0, 1, 2, 3, 4, 5
 PACKED_SIZE = _MONOMIAL + 4 * (DEGREE + 1)
 
 
-@inner_kernel
+@inlined_kernel
 def _reference(par, k, tau):
     """A polynomial of degree 6 with its first and second derivative, by Horner's rule."""
     top = par[k + DEGREE]
@@ -48,7 +48,7 @@ def _reference(par, k, tau):
     return value, first, 2.0 * half
 
 
-@inner_kernel
+@inlined_kernel
 def _output(par, i, tau, tau_rate, angle, rate):
     """Acceleration ``A + B z`` of one output (eq. 8 to 10)."""
     value, first, second = _reference(par, _MONOMIAL + i * (DEGREE + 1), tau)
@@ -60,7 +60,7 @@ def _output(par, i, tau, tau_rate, angle, rate):
     )
 
 
-@inner_kernel
+@inlined_kernel
 def command(par, a, da):
     """Accelerations ``alpha + beta z`` of the five links with ``z = ddtheta`` (eq. 8 to 13)."""
     tau = (-0.5 * (a[0] + a[2]) - par[_THETA_START]) * par[_SLOPE]

@@ -33,7 +33,7 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.jit import inner_kernel
+from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
 from biped_mfpt_ros.lanes import binary_exponent, mantissa, power_of_two, select
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot
@@ -121,7 +121,7 @@ def _with_sign(size, x):
     return select(x < 0.0, -size, size)
 
 
-@inner_kernel
+@inlined_kernel
 def _distance(rate, k, exponent):
     """``|sigma|`` on the slow manifold of eq. (21) to first order, where the law is ``rate``."""
     if exponent > 0.0:
@@ -129,7 +129,7 @@ def _distance(rate, k, exponent):
     return 0.0 * rate
 
 
-@inner_kernel
+@inlined_kernel
 def _slow(rate, distance, exponent, width):
     """Where the law is about ``rate``, and whether there is such a sigma."""
     size = abs(rate)
@@ -139,7 +139,7 @@ def _slow(rate, distance, exponent, width):
     return rate / STEEPEST, size <= STEEPEST * width
 
 
-@inner_kernel
+@inlined_kernel
 def _slope(rate, distance, exponent):
     """Slope of the slow manifold over ``rate``, s."""
     size = abs(rate)
@@ -148,7 +148,7 @@ def _slope(rate, distance, exponent):
     return 0.0 * rate
 
 
-@inner_kernel
+@inlined_kernel
 def _law(sigma, rate, distance, k, exponent, width):
     """-v of eq. (21) for one output; ``rate`` is dh / tau, ``distance`` as of `_distance`.
 
@@ -165,7 +165,7 @@ def _law(sigma, rate, distance, k, exponent, width):
     return select(bounded, rate + _with_sign(bound, excess), law)
 
 
-@inner_kernel
+@inlined_kernel
 def _sliding(sigma, rate, distance, inverse_tau, exponent):
     """-v of an output that slides.
 
@@ -181,7 +181,7 @@ def _sliding(sigma, rate, distance, inverse_tau, exponent):
     return rate / (1.0 - g) + DRIFT * (sigma - slow)
 
 
-@inner_kernel
+@inlined_kernel
 def _output(par, i, switched, slides, value, rate):
     """Acceleration of one output (eq. 18, 21); ``switched`` and ``slides`` are 0 or 1."""
     inverse_tau = par[_RATE + i]
@@ -195,7 +195,7 @@ def _output(par, i, switched, slides, value, rate):
     return -select(slides > 0.5, along, law)
 
 
-@inner_kernel
+@inlined_kernel
 def command(par, a, da, switched, slides):
     """Accelerations ``alpha + beta z`` of the five links, ``z`` that of the stance femur.
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.control.controller import HZD, SMC
 from biped_mfpt_ros.gait.scratch import COMMAND, CUT, MODE, SLIDES, SPARE, SWITCHED
-from biped_mfpt_ros.jit import inner_kernel
+from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
 from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker import robot as r
@@ -26,7 +26,7 @@ _NEAR = 1e3
 found as that with it and a change: as exact as solved anew, to some 1e-12, and in half the time."""
 
 
-@inner_kernel
+@inlined_kernel
 def _command(scheme, par, w, row, a, da, switched, slides):
     """Accelerations ``alpha + beta z`` that the controller wants, for the states in a row."""
     if scheme == HZD:
@@ -149,7 +149,7 @@ def mode_of(w, lane):
     )
 
 
-@inner_kernel
+@inlined_kernel
 def motion(scheme, rob, par, w, row, mode):
     """Motion under a controller, with a given set of torques cut off (eq. 2, 8, 16).
 

@@ -45,7 +45,7 @@ from biped_mfpt_ros.gait.scratch import (
     TRIG,
     H,
 )
-from biped_mfpt_ros.jit import inner_kernel
+from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
 from biped_mfpt_ros.lanes import (
     LANES,
     any_lane,
@@ -219,7 +219,7 @@ def _land(rob, w, v, lane, ahead, i, low, high, guess, h):
     return any_lane(touches)
 
 
-@inner_kernel
+@inlined_kernel
 def _moved(w, lane, at, away, a, da, s, c, h):
     """Angles, rates, sines and cosines a little ``away`` from where they are, at ``at``."""
     t = away * h
@@ -250,7 +250,7 @@ def _moved(w, lane, at, away, a, da, s, c, h):
     )
 
 
-@inner_kernel
+@inlined_kernel
 def _foot_at(rob, w, lane, at):
     """Position and velocity of the swing foot at fractions in lanes: x, y (m), dx, dy (m/s)."""
     a, da = state_at(w, lane, at)

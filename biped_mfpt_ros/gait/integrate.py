@@ -51,7 +51,7 @@ from biped_mfpt_ros.gait.scratch import (
     H,
     Y,
 )
-from biped_mfpt_ros.jit import inner_kernel
+from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
 from biped_mfpt_ros.lanes import load, select, store
 from biped_mfpt_ros.walker import robot as r
 
@@ -323,7 +323,7 @@ def _plus(w, row, weight, a, b):
     )
 
 
-@inner_kernel
+@inlined_kernel
 def _stage(scheme, rob, par, w, h, stage, into, columns, mode):
     """One stage, in all lanes: its state into a row, its derivative into one of its own."""
     n = _START[stage]
@@ -455,7 +455,7 @@ def prepare_dense(scheme, rob, par, w):
         store(w, DENSE + 6, i, h * t6)
 
 
-@inner_kernel
+@inlined_kernel
 def interpolate(w, lane, i, at):
     """Dense output of a column at the fraction ``at`` of the step."""
     rest = 1.0 - at
@@ -481,7 +481,7 @@ def interpolate(w, lane, i, at):
     )
 
 
-@inner_kernel
+@inlined_kernel
 def interpolated_slope(w, lane, i, at):
     """Its derivative over ``at``."""
     rest = 1.0 - at
@@ -498,7 +498,7 @@ def interpolated_slope(w, lane, i, at):
     return at * slope + (w[DENSE, i, lane] + rest * value)
 
 
-@inner_kernel
+@inlined_kernel
 def state_at(w, lane, at):
     """Angles and rates at the fraction ``at`` of the step."""
     a = (
