@@ -2,8 +2,7 @@
 
 Numba decides from a function's own file whether its cached machine code is still good, and does
 not see changes in the functions that it calls from other files. So the cache directory carries a
-digest of every kernel source and the number of lanes: any change gives a fresh directory, and
-nothing stale is ever run.
+digest of every kernel source: any change gives a fresh directory, and nothing stale is ever run.
 The same digest, with the robot's data, identifies the step map to other processes: two processes
 with equal `STEP_MAP` compute the same steps.
 """
@@ -17,7 +16,6 @@ from pathlib import Path
 import numba
 
 from biped_mfpt_ros import __version__
-from biped_mfpt_ros.lanes import LANES
 
 _PACKAGE = Path(__file__).parent
 # What decides the result of a step: the kernels and the robot's data.
@@ -51,7 +49,7 @@ CACHE_DIR = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "
 """Where compiled kernels are kept, in one directory for each state of the kernel sources."""
 
 if not os.environ.get("NUMBA_CACHE_DIR"):
-    numba.config.CACHE_DIR = str(CACHE_DIR / f"{numba.__version__}-{KERNELS}-{LANES}")
+    numba.config.CACHE_DIR = str(CACHE_DIR / f"{numba.__version__}-{KERNELS}")
 
 kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 """Decorator of every numeric kernel: compiled once, cached on disk, run without the GIL."""

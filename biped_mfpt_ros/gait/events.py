@@ -40,8 +40,6 @@ CUT_RESOLUTION = 1e-9
 """Of the torque limit: how far a torque may be beyond it before it is cut off."""
 TORQUES, SLIP, LIFT = range(3)
 """What changes its sign: torques beyond their limits, the margin against slipping, the load."""
-TRIED_AT_ONCE = 4
-"""Places in a step; where there are more lanes, the others repeat the last one."""
 _MOST_ROUNDS = 60
 
 
@@ -58,14 +56,14 @@ def switch_root(scheme, par, w, lane, switched, span):
     low, high = 0.0, 1.0
     while (high - low) * span > TIME_RESOLUTION:
         # Five parts at once.
-        width = (high - low) / (TRIED_AT_ONCE + 1)
+        width = (high - low) / (LANES + 1)
         if low + width <= low or high - width >= high:
             break
         for k in range(LANES):
-            w[PLACES, AT, k] = low + (min(k, TRIED_AT_ONCE - 1) + 1) * width
+            w[PLACES, AT, k] = low + (k + 1) * width
         a, _ = state_at(w, lane, load(w, PLACES, AT))
         store(w, PLACES, VALUE, switch(scheme, par, a))
-        for k in range(TRIED_AT_ONCE):
+        for k in range(LANES):
             if (w[PLACES, VALUE, k] > 0.0) != switched:
                 low = w[PLACES, AT, k]
             else:
@@ -170,9 +168,9 @@ def _crossing(scheme, rob, par, w, lane, what, low, high, places, enough, span):
     evaluations = 0
     for _ in range(_MOST_ROUNDS):
         for n in range(LANES):
-            w[PLACES, TRIED, n] = places[min(n, TRIED_AT_ONCE - 1)]
+            w[PLACES, TRIED, n] = places[n]
         wanted, _, force = motion_at(scheme, rob, par, w, lane, load(w, PLACES, TRIED))
-        evaluations += TRIED_AT_ONCE
+        evaluations += LANES
         for n in range(4):
             store(w, PLACES, TRIED_TORQUES + n, wanted[n])
         if what == TORQUES:
@@ -182,7 +180,7 @@ def _crossing(scheme, rob, par, w, lane, what, low, high, places, enough, span):
         else:
             store(w, PLACES, TRIED_VALUE, sign * force[1])
         nearest = 0
-        for n in range(1, TRIED_AT_ONCE):
+        for n in range(1, LANES):
             if abs(w[PLACES, TRIED_VALUE, n]) < abs(w[PLACES, TRIED_VALUE, nearest]):
                 nearest = n
         at = w[PLACES, TRIED, nearest]
@@ -218,13 +216,13 @@ def first_change(scheme, rob, par, w, lane, start, span):
     cut, _, _ = mode_of(w, lane)
     slack = CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
     for n in range(LANES):
-        w[PLACES, AT, n] = min((n + 1) / TRIED_AT_ONCE, 1.0)
+        w[PLACES, AT, n] = (n + 1) / LANES
     wanted, _, _ = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
     store(w, PLACES, VALUE, beyond(rob, cut, wanted))
     f0, f1 = w[PLACES, VALUE, 0], w[PLACES, VALUE, 1]
     f2, f3 = w[PLACES, VALUE, 2], w[PLACES, VALUE, 3]
     if f0 <= slack and f1 <= slack and f2 <= slack and f3 <= slack:
-        return 2.0, -1, 0.0, TRIED_AT_ONCE
+        return 2.0, -1, 0.0, LANES
     # What is at the limit, to rounding, is not beyond it yet.
     f0, f1, f2 = f0 - slack, f1 - slack, f2 - slack
     values = (-math.inf, min(start, 0.0) - slack, f0, f1, f2, f3)
@@ -245,7 +243,7 @@ def first_change(scheme, rob, par, w, lane, start, span):
             held = 0.0
             if sign == 0.0:
                 held = 1.0 if torque > 0.0 else -1.0
-    return at, joint, held, TRIED_AT_ONCE + evaluations
+    return at, joint, held, LANES + evaluations
 
 
 @inner_kernel
@@ -303,7 +301,7 @@ def slip_root(scheme, rob, par, w, lane, what, low, low_value, high, high_value,
     if (low_value > 0.0) == (high_value > 0.0):
         return low, 0  # it had begun (or ended) with a jump, there
     enough = 1e-9 * rob[r.MASS] * rob[r.GRAVITY]
-    part = (high - low) / (TRIED_AT_ONCE + 1)
+    part = (high - low) / (LANES + 1)
     places = (low + part, low + 2.0 * part, low + 3.0 * part, low + 4.0 * part)
     at, _, evaluations = _crossing(
         scheme,

@@ -69,7 +69,7 @@ _OFF_CUBIC = 3e-4  # m: what the height of the foot differs from a cubic within 
 _LOWEST_RESOLUTION = 1e-7  # s
 _ROOT_RESOLUTION = 1e-12  # s
 _NEWTON_RESOLUTION = 1e-7  # s: what Newton's method may move to leave less than that
-_COUNT = np.minimum(np.arange(1.0, FOOT_PARTS + LANES), FOOT_PARTS)[None]
+_COUNT = np.arange(1.0, FOOT_PARTS + 1)[None]
 
 _STEP = float(Outcome.STEP)
 _SCUFFS = int(Outcome.SWING_SCUFFS)

@@ -55,9 +55,8 @@ def _simulate(
 
     A lane that has ended its swing takes the next state. No swing is begun after
     ``most_evaluations``; those are dropped that only begun since they were under way at once, so
-    that what is left does not depend on the number of lanes. Returns how many states were
-    simulated, states after impact of the steps that succeeded, in order, integrator steps and
-    evaluations.
+    that what is left does not depend on how many are. Returns how many states were simulated,
+    states after impact of the steps that succeeded, in order, integrator steps and evaluations.
     """
     n, m = outcomes.shape
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))

@@ -28,7 +28,6 @@ from biped_mfpt_ros.gait.events import (
     CUT_RESOLUTION,
     LIFT,
     SLIP,
-    TRIED_AT_ONCE,
     first_change,
     force_once,
     motion_at,
@@ -558,14 +557,14 @@ def _first_fall(scheme, rob, par, w, v, lane, end, h):
     t, since = v[TIME, lane], v[SINCE, lane]
     last, last_value = 0.0, v[MARGIN, lane]
     slipping = since >= 0.0
-    samples = TRIED_AT_ONCE * (1 + int(end * h / (TRIED_AT_ONCE * _SLIP_INTERVAL)))
+    samples = LANES * (1 + int(end * h / (LANES * _SLIP_INTERVAL)))
     for k in range(samples):
-        place = k % TRIED_AT_ONCE
+        place = k % LANES
         if place == 0:
             for i in range(LANES):
-                w[PLACES, AT, i] = end * (k + min(i, TRIED_AT_ONCE - 1) + 1) / samples
+                w[PLACES, AT, i] = end * (k + i + 1) / samples
             _, _, force = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
-            v[EVALUATIONS, lane] += TRIED_AT_ONCE
+            v[EVALUATIONS, lane] += LANES
             store(w, PLACES, VALUE, margin(rob, force))
             store(w, PLACES, LOAD, force[1])
         at, value, normal = w[PLACES, AT, place], w[PLACES, VALUE, place], w[PLACES, LOAD, place]
