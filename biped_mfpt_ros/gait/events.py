@@ -10,8 +10,6 @@ import math
 from biped_mfpt_ros.control import smc
 from biped_mfpt_ros.gait.closed_loop import (
     beyond,
-    lane_angles,
-    lane_rates,
     margin,
     mode_of,
     motion,
@@ -31,7 +29,7 @@ from biped_mfpt_ros.gait.scratch import (
     VALUE,
 )
 from biped_mfpt_ros.jit import inner_kernel
-from biped_mfpt_ros.lanes import LANES, lane_of, load, splat, store
+from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat, store
 from biped_mfpt_ros.walker import robot as r
 
 TIME_RESOLUTION = 1e-12
@@ -51,8 +49,23 @@ def next_guess(low, low_value, high, high_value):
 
 
 @inner_kernel
-def switch_root(scheme, par, w, lane, switched, span):
-    """Where the controller switches, as a fraction of the step: just on the far side."""
+def _seek(scheme, rob, par, w, lane, output):
+    """What `_first_negative` is about, at the places of row PLACES; ``output`` -1: the switch."""
+    at = load(w, PLACES, AT)
+    if output < 0:
+        a, _ = state_at(w, lane, at)
+        sign = -1.0 if w[MODE, SWITCHED, lane] > 0.5 else 1.0
+        store(w, PLACES, VALUE, sign * switch(scheme, par, a))
+    else:
+        store(w, PLACES, VALUE, _off_slide(scheme, rob, par, w, lane, output, at))
+
+
+@inner_kernel
+def _first_negative(scheme, rob, par, w, lane, output, span):
+    """Where a function that may jump first falls below zero, as a fraction: just on the far side.
+
+    It is positive at the start of the step and not at its end.
+    """
     low, high = 0.0, 1.0
     while (high - low) * span > TIME_RESOLUTION:
         # Five parts at once.
@@ -61,15 +74,20 @@ def switch_root(scheme, par, w, lane, switched, span):
             break
         for k in range(LANES):
             w[PLACES, AT, k] = low + (k + 1) * width
-        a, _ = state_at(w, lane, load(w, PLACES, AT))
-        store(w, PLACES, VALUE, switch(scheme, par, a))
+        _seek(scheme, rob, par, w, lane, output)
         for k in range(LANES):
-            if (w[PLACES, VALUE, k] > 0.0) != switched:
+            if w[PLACES, VALUE, k] > 0.0:
                 low = w[PLACES, AT, k]
             else:
                 high = w[PLACES, AT, k]
                 break
     return high
+
+
+@inner_kernel
+def switch_root(scheme, rob, par, w, lane, span):
+    """Where the controller switches, as a fraction of the step: just on the far side."""
+    return _first_negative(scheme, rob, par, w, lane, -1, span)
 
 
 @inner_kernel
@@ -247,41 +265,29 @@ def first_change(scheme, rob, par, w, lane, start, span):
 
 
 @inner_kernel
-def slide_root(scheme, rob, par, w, lane, i, span):
+def slide_root(scheme, rob, par, w, lane, output, span):
     """Where an output begins to slide, given that it does by the end of the step.
 
     1 if it was about to at the start: not a crossing.
     """
-    low, high = 0.0, 1.0
-    low_value = _off_slide(scheme, rob, par, w, lane, i, low)
-    high_value = _off_slide(scheme, rob, par, w, lane, i, high)
-    if not (low_value > 0.0 and high_value <= 0.0):
+    for k in range(LANES):
+        w[PLACES, AT, k] = k / (LANES - 1)
+    _seek(scheme, rob, par, w, lane, output)
+    if not (w[PLACES, VALUE, 0] > 0.0 and w[PLACES, VALUE, LANES - 1] <= 0.0):
         return 1.0
-    while (high - low) * span > TIME_RESOLUTION:
-        at = 0.5 * (low + high)
-        if at <= low or at >= high:
-            break
-        if _off_slide(scheme, rob, par, w, lane, i, at) > 0.0:
-            low = at
-        else:
-            high = at
-    return high
+    return _first_negative(scheme, rob, par, w, lane, output, span)
 
 
 @inner_kernel
-def _off_slide(scheme, rob, par, w, lane, i, at):
-    a, da = state_at(w, lane, splat(at))
-    for k in range(5):
-        store(w, SPARE, k, a[k])
-        store(w, SPARE, 5 + k, da[k])
-    off = smc.off_slide(
-        par, i, lane_angles(w, SPARE, 0), lane_rates(w, SPARE, 0), w[MODE, SWITCHED, lane]
-    )
-    if off <= 0.0:
-        mode = mode_of(w, lane)
-        _, wanted, _, _, _, _ = motion(scheme, rob, par, w, SPARE, mode)
-        if lane_of(beyond(rob, mode[0], wanted), 0) > -smc.CLEAR * rob[r.TORQUE_LIMIT]:
-            off = 1.0
+def _off_slide(scheme, rob, par, w, lane, output, at):
+    """`smc.off_slide` at fractions in lanes, positive also where a torque is near its limit."""
+    a, da = state_at(w, lane, at)
+    off = smc.off_slide(par, output, a, da, splat(w[MODE, SWITCHED, lane]))
+    if any_lane(off <= 0.0):
+        wanted, _, _ = motion_at(scheme, rob, par, w, lane, at)
+        cut, _, _ = mode_of(w, lane)
+        limited = beyond(rob, cut, wanted) > -smc.CLEAR * rob[r.TORQUE_LIMIT]
+        off = select((off <= 0.0) & limited, 1.0, off)
     return off
 
 

@@ -27,8 +27,9 @@ WORK = 10
     ESTIMATE,  # of the error, and what else was seen in the stages, columns below
     FEET,  # swing foot within the step: x, y (m), dx, dy (m/s), some places in the lanes
     PLACES,  # of one lane, at as many fractions of the step as there are lanes: columns below
-) = range(9)
-LOBE = 9
+    SLIDING,  # how far four outputs are from sliding at the end of the step: not at 0 and below
+) = range(10)
+LOBE = 10
 """Row of the first of four joints: up to four fractions of the step where the joint's power changes
 its sign, 2 after the last, then its work up to each of them (J)."""
 STAGE = LOBE + 4

@@ -12,6 +12,7 @@ import math
 from biped_mfpt_ros.control import smc
 from biped_mfpt_ros.control.controller import SMC
 from biped_mfpt_ros.gait.closed_loop import (
+    angles,
     beyond,
     cut_off,
     lane_angles,
@@ -103,6 +104,7 @@ from biped_mfpt_ros.gait.scratch import (
     SIZE,
     SLIDE,
     SLIDES,
+    SLIDING,
     SLIPS,
     SPENT,
     STAGE,
@@ -121,7 +123,7 @@ from biped_mfpt_ros.gait.scratch import (
     Y,
 )
 from biped_mfpt_ros.jit import inner_kernel
-from biped_mfpt_ros.lanes import LANES, lane_of, load, splat, store
+from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat, store
 from biped_mfpt_ros.walker import robot as r
 from biped_mfpt_ros.walker.dynamics import foot, sine_cosine, sines
 from biped_mfpt_ros.walker.outcome import Outcome
@@ -290,19 +292,27 @@ def _restart(scheme, rob, par, w, v):
 
 
 @inner_kernel
-def _begins_to_slide(rob, par, w, lane):
+def _find_slides(rob, par, w):
+    """How far outputs are from sliding at the end of the step, in all lanes, into the row SLIDING.
+
+    Not at all where a torque is at its limit or near, or an output slides already.
+    """
+    a, da = angles(w, Y_NEW), rates(w, Y_NEW)
+    cut, switched, slides = mode_of_all(w)
+    may = (cut[0] == 0.0) & (cut[1] == 0.0) & (cut[2] == 0.0) & (cut[3] == 0.0)
+    may = may & (load(w, ESTIMATE, CLEARANCE) <= -smc.CLEAR * rob[r.TORQUE_LIMIT])
+    for i in range(4):
+        store(w, SLIDING, i, math.inf)
+        if any_lane(may):
+            off = smc.off_slide(par, i, a, da, switched)
+            store(w, SLIDING, i, select(may & (slides[i] == 0.0), off, math.inf))
+
+
+@inner_kernel
+def _begins_to_slide(w, lane):
     """Whether an output may slide at the end of the step, and did not before."""
-    if w[ESTIMATE, CLEARANCE, lane] > -smc.CLEAR * rob[r.TORQUE_LIMIT]:
-        return False
-    for i in range(4):
-        if w[MODE, CUT + i, lane] != 0.0:
-            return False
-    a, da = lane_angles(w, Y_NEW, lane), lane_rates(w, Y_NEW, lane)
-    for i in range(4):
-        slides = w[MODE, SLIDES + i, lane] != 0.0
-        if not slides and smc.off_slide(par, i, a, da, w[MODE, SWITCHED, lane]) <= 0.0:
-            return True
-    return False
+    least = min(w[SLIDING, 0, lane], w[SLIDING, 1, lane])
+    return min(least, w[SLIDING, 2, lane], w[SLIDING, 3, lane]) <= 0.0
 
 
 @inner_kernel
@@ -352,6 +362,8 @@ def advance(scheme, rob, par, w, v, active, ahead, trace):
     if not active.any():
         return
     trial_step(scheme, rob, par, w)
+    if scheme == SMC:
+        _find_slides(rob, par, w)
     dense = False
     for lane in range(LANES):
         if active[lane]:
@@ -430,7 +442,7 @@ def _inspect(scheme, rob, par, w, v, lane, ahead):
         near = near or x >= 0.0 or _may_reach(v, lane, -back[0], back[1], h)
     else:
         near = near or x < 0.0 or _may_reach(v, lane, -slope[0], slope[1], h)
-    slide = scheme == SMC and _begins_to_slide(rob, par, w, lane)
+    slide = scheme == SMC and _begins_to_slide(w, lane)
     v[SLIDE, lane] = 1.0 if slide else 0.0
     v[CHANGES, lane] = 1.0 if changes else 0.0
     v[SWITCHES, lane] = 1.0 if switches else 0.0
@@ -465,7 +477,7 @@ def _finish(scheme, rob, par, w, v, lane, ahead, trace):
         if joint >= 0:
             end = min(1.0, max(at, _SHORTEST_STEP / h))
     if v[SWITCHES, lane] != 0.0:
-        at = switch_root(scheme, par, w, lane, w[MODE, SWITCHED, lane] > 0.5, h)
+        at = switch_root(scheme, rob, par, w, lane, h)
         if at <= end:
             end, joint, switches = at, -1, True
     if v[SLIDE, lane] != 0.0:
