@@ -12,6 +12,7 @@ from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -105,8 +106,14 @@ def controller_from(message: msg.Controller, name: str = "controller") -> Contro
             raise InputError(f"{name}.scheme", message.scheme, f"{named.scheme} or empty")
         return named
     with _inside(name):
-        made = Controller(message.name, message.scheme, unpacked(message.parameters, "d"))
-        made.packed(rabbit())  # checks ranges
+        return _checked(message.name, message.scheme, unpacked(message.parameters, "d").tobytes())
+
+
+@lru_cache(maxsize=8)
+def _checked(name: str, scheme: str, parameters: bytes) -> Controller:
+    """A controller that can be used. A mesh asks for the same one again and again."""
+    made = Controller(name, scheme, np.frombuffer(parameters))
+    made.packed(rabbit())  # checks ranges
     return made
 
 
