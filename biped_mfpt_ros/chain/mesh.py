@@ -26,7 +26,9 @@ targets of eq. (27).
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any, Protocol
@@ -59,6 +61,7 @@ SCALE_REFRESHES = ("generation", "addition")
 _ROUNDING = 1e-12
 
 _CHECKED_ROWS = 4096
+_WORTH_THREADS = 2000  # states
 
 
 class MeshLimitError(RuntimeError):
@@ -568,19 +571,27 @@ class MeshGrowth:
 
     def mesh(self) -> Mesh:
         """The mesh, once it is complete."""
-        n, m = self.known, len(self._slopes)
+        n, m, scales = self.known, len(self._slopes), self._scales
         assert self.complete
-        assert self._scales is not None
+        assert scales is not None
         targets = np.zeros((n, m), dtype=np.uint32)
         outcomes = np.full((n, m), NOT_SIMULATED, np.uint8)
-        row = 1
-        for tried, reached in self._pieces(1, n):
-            outcomes[row : row + len(tried)] = tried
+
+        def fill(start: int) -> None:
+            tried, reached = self._answers.get(start)
+            outcomes[start : start + len(tried)] = tried
             steps = np.flatnonzero(tried == _STEP)
-            targets.reshape(-1)[row * m + steps] = self._found.nearest(
-                reached, self._clusters(_slope_indices(steps, m)), self._scales
+            targets.reshape(-1)[start * m + steps] = self._found.nearest(
+                reached, self._clusters(_slope_indices(steps, m)), scales
             )
-            row += len(tried)
+
+        # The targets of one piece are independent of all others.
+        starts = [1]
+        while (end := starts[-1] + self._answers.rows(starts[-1])) < n:
+            starts.append(end)
+        with ThreadPoolExecutor((os.cpu_count() or 1) if n >= _WORTH_THREADS else 1) as pool:
+            for _ in pool.map(fill, starts):
+                pass
         generation = np.repeat(
             np.arange(self.generations, dtype=np.uint32), np.diff([0, *self._starts[1:]])
         )
@@ -591,7 +602,7 @@ class MeshGrowth:
             generation=generation,
             targets=targets,
             outcomes=outcomes,
-            scales=self._scales,
+            scales=scales,
             threshold=self._threshold,
             clustered=self._clustered,
         )
