@@ -18,9 +18,9 @@ from biped_mfpt_msgs.srv import SimulateSteps
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-from biped_mfpt_ros.nodes.fair_service import Aside
 from biped_mfpt_ros.nodes.messages import packed, unpacked_rows
 from biped_mfpt_ros.nodes.qos import REQUESTS
+from biped_mfpt_ros.nodes.simulators import Aside
 from biped_mfpt_ros.nodes.spin import keep_freed_memory, prepare_environment
 from biped_mfpt_ros.walker.robot import STATE_SIZE
 

@@ -104,14 +104,11 @@ class Analysis(Node):
             RESULTS,
         )
         self.create_timer(1.0, self._give_up_overdue)
-        self._service = FairService(
-            self, ComputeMfpt, "compute_mfpt", _MOST_WAITING, self._thread, self._compute
-        )
+        FairService(self, ComputeMfpt, "compute_mfpt", _MOST_WAITING, self._thread, self._compute)
         self.get_logger().info("ready")
 
     def close(self) -> None:
         """Stop computing."""
-        self._service.close()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _add(self, message: Any, add: Callable[[MeshAssembly, Any], None]) -> None:

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
-import traceback
 import uuid
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from rclpy.callback_groups import CallbackGroup
-from rclpy.guard_condition import GuardCondition
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 
 from biped_mfpt_ros.nodes.qos import REQUESTS
 
 _MOST_OF_NAME = 256  # characters of a client's name that count
 _TURN = 0.05  # s, that a turn is worth: what a mesher asks for at once
 _MOST_DEBT = 10.0  # s
-_LOOK_PERIOD = 0.2  # s, between two looks whether the context has ended
 
 T = TypeVar("T")
 
@@ -97,36 +94,19 @@ class Waiting(Generic[T]):
         return client, item
 
 
-class Aside(CallbackGroup):
-    """What is in here is left alone by the executor."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Never."""
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Never."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Nothing to do."""
-
-
 @dataclass(eq=False)
 class _Request:
     asked: Any
-    header: Any
+    response: Any
+    answered: Future[Any] = field(default_factory=Future)
 
 
 class FairService:
-    """A service of a node, computed in a thread while another one takes further requests.
+    """A service of a node, computed in a thread while the node's executor takes further requests.
 
     A ROS 2 service has one queue for all clients, which loses the oldest request when it is full,
     and rclpy does not tell whose request is whose. So this empties that queue at once, and goes by
     the ``client`` that requests name. No request that is taken is left without an answer.
-
-    It waits for requests by itself: the way through the node's executor costs more than a small
-    request, since that looks at everything that the node has several times for each.
 
     Parameters
     ----------
@@ -156,85 +136,42 @@ class FairService:
         compute: Callable[[Any, Any], Any],
     ) -> None:
         self._node = node
-        self._kind = kind
         self._most = most
         self._thread = thread
         self._compute = compute
         self._lock = threading.Lock()
         self._waiting: Waiting[_Request] = Waiting(most)
         self._working = False
-        self._closed = False
-        self._woken = GuardCondition(None, None, context=node.context)
-        self._service = node.create_service(
-            kind, name, lambda asked, response: response, qos_profile=REQUESTS,
-            callback_group=Aside(),
-        )  # fmt: skip
-        self._taker = threading.Thread(target=self._take, name=f"requests of {name}")
-        self._taker.start()
+        node.create_service(
+            kind, name, self._serve, qos_profile=REQUESTS, callback_group=ReentrantCallbackGroup()
+        )
 
-    def close(self) -> None:
-        """Take no further request; to be called before the node is destroyed."""
-        self._closed = True
-        self._woken.trigger()
-        self._taker.join()
-
-    def _going_on(self) -> bool:
-        return not self._closed and self._node.context.ok()
-
-    def _take(self) -> None:
-        """Take requests as they come, until the service is closed or the context ends."""
-        while self._going_on():
-            try:
-                with self._service.handle, self._woken.handle, self._node.context.handle:
-                    wait_set = rclpy_implementation.WaitSet(
-                        0, 1, 0, 0, 1, 0, self._node.context.handle
-                    )
-                    while self._going_on():
-                        wait_set.clear_entities()
-                        wait_set.add_service(self._service.handle)
-                        wait_set.add_guard_condition(self._woken.handle)
-                        wait_set.wait(round(1e9 * _LOOK_PERIOD))
-                        if wait_set.get_ready_entities("service"):
-                            self._serve()
-            except Exception:
-                # What a client sent may be no request.
-                self._log_error("a request could not be taken")
-
-    def _serve(self) -> None:
-        asked, header = self._service.handle.service_take_request(self._kind.Request)
-        if asked is None:
-            return
+    async def _serve(self, asked: Any, response: Any) -> Any:
+        request = _Request(asked, response)
         with self._lock:
-            refused = self._waiting.put(asked.client[:_MOST_OF_NAME], _Request(asked, header))
+            refused = self._waiting.put(asked.client[:_MOST_OF_NAME], request)
             if not self._working:
                 self._working = True
                 self._thread.submit(self._work)
         if refused is not None:
-            message = (
+            refused.response.busy = True
+            refused.response.message = (
                 f"busy: at most {self._most} requests wait, and no client has more than this one; "
                 "ask again later"
             )
-            self._answer(refused, self._kind.Response(busy=True, message=message))
+            refused.answered.set_result(refused.response)
+        return await request.answered
 
     def _work(self) -> None:
         """Answer the next request, and have what else the thread has to do done before another."""
         with self._lock:
             client, request = self._waiting.get()
         start = time.perf_counter()
-        self._answer(request, self._compute(request.asked, self._kind.Response()))
+        request.answered.set_result(self._compute(request.asked, request.response))
+        if self._node.executor is not None:
+            self._node.executor.wake()
         with self._lock:
             self._waiting.charge(client, time.perf_counter() - start)
             self._working = len(self._waiting) > 0
             if self._working:
                 self._thread.submit(self._work)
-
-    def _answer(self, request: _Request, response: Any) -> None:
-        try:
-            self._service.send_response(response, request.header)
-        except Exception:
-            # The client has gone, or the answer cannot be converted.
-            self._log_error("a request could not be answered")
-
-    def _log_error(self, what: str) -> None:
-        if self._node.context.ok():
-            self._node.get_logger().error(f"{what}; going on\n{traceback.format_exc()}")

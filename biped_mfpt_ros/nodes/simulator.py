@@ -69,14 +69,13 @@ class Simulator(Node):
         with compiled(self.get_logger().info, "the step map"):
             warm_up()
         self._thread = ThreadPoolExecutor(1, "step map")
-        self._service = FairService(
+        FairService(
             self, SimulateSteps, "~/simulate_steps", MOST_WAITING, self._thread, self._simulate
         )
         self.get_logger().info(f"ready, with step map {STEP_MAP}")
 
     def close(self) -> None:
         """Stop simulating, after the request that is computed."""
-        self._service.close()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _simulate(

@@ -7,6 +7,7 @@ from contextlib import ExitStack, suppress
 from typing import Any
 
 from biped_mfpt_msgs.srv import SimulateSteps
+from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
@@ -14,12 +15,27 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-from biped_mfpt_ros.nodes.fair_service import Aside, client_name
+from biped_mfpt_ros.nodes.fair_service import client_name
 from biped_mfpt_ros.nodes.qos import REQUESTS
 
 SERVICE_TYPE = "biped_mfpt_msgs/srv/SimulateSteps"
 
 _LOOK_PERIOD = 0.2  # s, between two looks at the graph
+
+
+class Aside(CallbackGroup):
+    """What is in here is left alone by the executor."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Never."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Never."""
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Nothing to do."""
 
 
 class GraphSimulators:
