@@ -256,7 +256,10 @@ def test_every_outcome_occurs():
         WalkerModel(time_limit=0.1, tolerance=1e-6),
     ):
         steps = simulate_steps(control, states, np.zeros(len(states)), SLOPES, model)
-        assert len(steps.next_states) == (steps.outcomes == Outcome.STEP).sum()
+        falls = steps.outcomes != Outcome.STEP
+        assert len(steps.next_states) == (~falls).sum()
+        assert (steps.step_lengths[falls] == 0.0).all()
+        assert (steps.step_lengths[~falls] > 0.0).all()
         codes = {Outcome(int(code)) for code in np.unique(steps.outcomes)}
         if model.friction == math.inf:
             assert codes.isdisjoint({Outcome.STANCE_SLIPS, Outcome.IMPACT_SLIPS})

@@ -185,6 +185,7 @@ def _body_lands(rob, w, v, lane, ahead, i, at, h):
     at = _body_root(rob, w, lane, back, (ahead[SINE, i], ahead[COSINE, i]), at)
     ahead[OUTCOME, i] = _BODY
     ahead[DURATION, i] = v[TIME, lane] + at * h
+    ahead[LENGTH, i] = 0.0
     ahead[SPENT, i] = lane_of(energy_at(w, v, lane, splat(at)), 0)
 
 
