@@ -100,12 +100,15 @@ def test_mesh_and_walks_as_confirmed(name):
         lambda states, previous: simulate_steps(control, states, previous, slopes),
         cycle.state, slopes, wanted["threshold"], max_states=2 * wanted["states"],
     )  # fmt: skip
-    # The mesh is a function of the step map to the last bit; another one that is as exact (2e-7)
-    # moves single states over the threshold.
-    assert len(mesh.states) == pytest.approx(wanted["states"], rel=0.01)
     for sigma_deg, mfpt in wanted["mfpt"].items():
         value = metastability(mesh, 0.0, math.radians(float(sigma_deg))).mfpt
         assert math.log10(value) == pytest.approx(math.log10(mfpt), rel=0.01)
+    # The mesh is a function of the step map to the last bit; another one that is as exact (2e-7)
+    # moves single states over the threshold. In sliding mode, which is not smooth, all that only
+    # they lead to comes with them: three such maps gave 607478, 661912 and 658593 states, and MFPT
+    # that differ by 6 % at 1e22 steps and by 0.02 % at 55.
+    few = 0.1 if control.scheme == "smc" else 0.01
+    assert len(mesh.states) == pytest.approx(wanted["states"], rel=few)
     given = figures["walks"]
     for sigma_deg, mean in given["mean_steps"].items():
         found = monte_carlo(
