@@ -28,10 +28,10 @@ from biped_mfpt_ros.errors import InputError
 RELATIVE = 1e-10
 
 
-@pytest.fixture(params=["iteration", "dense"])
+@pytest.fixture(params=["iteration", "aggregation"])
 def method(request, monkeypatch):
     """Both ways to solve a chain; the first falls back to the second where it does not settle."""
-    if request.param == "dense":
+    if request.param == "aggregation":
         monkeypatch.setattr(markov, "_STEPS", 0)
     return request.param
 
@@ -39,7 +39,8 @@ def method(request, monkeypatch):
 @pytest.fixture
 def only_iteration(monkeypatch):
     """Anything but iteration is an error."""
-    monkeypatch.setattr(markov, "DENSE_LIMIT", 0)
+    monkeypatch.setattr(markov, "metastable_distribution", lambda *_: None)
+    monkeypatch.setattr(markov, "passage_times", lambda *_: None)
 
 
 def solve(rows, probabilities, code=2) -> Metastability:
@@ -358,11 +359,13 @@ def test_both_methods_agree_on_a_larger_chain(monkeypatch):
     iterated = solve(rows, p)
     times = iterated.mfpt_from_state
     monkeypatch.setattr(markov, "_STEPS", 0)
-    dense = solve(rows, p)
-    assert iterated.mfpt == pytest.approx(dense.mfpt, rel=1e-11)
-    assert times == pytest.approx(dense.mfpt_from_state, rel=1e-11)
-    matters = dense.distribution > 1e-11 * dense.failure_probability
-    assert iterated.distribution[matters] == pytest.approx(dense.distribution[matters], rel=1e-11)
+    aggregated = solve(rows, p)
+    assert iterated.mfpt == pytest.approx(aggregated.mfpt, rel=1e-11)
+    assert times == pytest.approx(aggregated.mfpt_from_state, rel=1e-11)
+    matters = aggregated.distribution > 1e-11 * aggregated.failure_probability
+    assert iterated.distribution[matters] == pytest.approx(
+        aggregated.distribution[matters], rel=1e-11
+    )
 
 
 def test_usual_chains_are_iterated(only_iteration):
@@ -691,14 +694,12 @@ def test_chain_arrays_are_checked(field, change):
         solve_chain(**{**good, **change})
 
 
-def test_too_large_and_too_slow_is_a_clear_error(monkeypatch):
-    monkeypatch.setattr(markov, "DENSE_LIMIT", 299)
+def test_too_slow_is_a_clear_error(only_iteration):
     with pytest.raises(ChainError, match="300 states"):
         solve(birth_death(300, ends=(0, 0)), [0.5, 0.5])
 
 
-def test_an_unsolved_distribution_leaves_the_others(monkeypatch):
-    monkeypatch.setattr(markov, "DENSE_LIMIT", 1)
+def test_an_unsolved_distribution_leaves_the_others(monkeypatch, only_iteration):
     monkeypatch.setattr(markov, "_STEPS", 500)
     targets = np.array([[0] * 4, [1, 0, 1, 2], [2, 2, 0, 2]], dtype=np.uint32)
     outcomes = np.where(targets == 0, 9, 0).astype(np.uint8)

@@ -17,7 +17,7 @@ itself.
 phi is the limit of the distribution after k steps, given no fall so far, and is iterated so (see
 `iteration`, where the rule to stop is justified). That is made of sums of products that are not
 negative, and so accurate in every component. Chains that mix too slowly for that, have a long
-period, or several closed parts, are solved if they are small (see `elimination`).
+period, or several closed parts, are solved by aggregation (see `aggregation`).
 """
 
 from __future__ import annotations
@@ -36,21 +36,19 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from biped_mfpt_ros.chain import iteration
-from biped_mfpt_ros.chain.elimination import eliminated_times, squared_distribution
+from biped_mfpt_ros.chain.aggregation import ROUNDS, metastable_distribution, passage_times
 from biped_mfpt_ros.chain.lanes import LANES
 from biped_mfpt_ros.chain.mesh import Mesh, check_transitions, checked_array
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.walker.terrain import check_slopes
 
-DENSE_LIMIT = 2000
-"""Most states of a chain that is not iterated; time grows with the cube, memory with the square."""
-
 TOLERANCE = 1e-12
 """Relative accuracy aimed at, in the MFPT and in every state's weight."""
 
 _STEPS = 3000
 _ASIDE_STEPS = 1000
+_MOST_SURVIVAL = 1e300
 # Times in a step's weight that count as visited again and again.
 _OFTEN = 0.1
 _WORTH_THREADS = 1_000_000  # transitions times columns
@@ -59,7 +57,7 @@ _CANCELLATION = 1e3
 
 
 class ChainError(RuntimeError):
-    """The chain mixes too slowly to be iterated and is too large to be solved otherwise."""
+    """The chain mixes too slowly to be iterated, and aggregation does not settle either."""
 
 
 # Probabilities, transitions ---------------------------------------------------------------------
@@ -186,7 +184,8 @@ class Metastability:
         Metastable distribution phi, shape (n,), sum 1, index 0 is 0. It has no weight on states
         that are not visited again and again. Where lambda_2 is 0 it is one from which every
         step falls; where no fall can be reached from some states, it is stationary on those.
-        Weights below about 1e-12 (1 - lambda_2) / n may be off: they do not matter for falls.
+        Weights below about 1e-12 (1 - lambda_2) / n may be off: they do not matter for falls. So
+        may the shares of parts that fall alike to 1e-12 and hardly ever change into each other.
     failure_shares : dict of int to float
         Share of each outcome code in the falls from the metastable distribution, ascending code,
         codes without share left out; sums to 1. Empty if there are no falls.
@@ -211,7 +210,7 @@ class Metastability:
         Raises
         ------
         ChainError
-            If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
+            If the chain mixes too slowly to be iterated, and aggregation does not settle either.
         """
         targets, probabilities = self._targets, self._probabilities
         slopes = np.flatnonzero(probabilities)
@@ -220,11 +219,16 @@ class Metastability:
         among = ~endless
         among[0] = False
         escape = 0.0 if endless.any() else self.failure_probability
-        times = _iterated_times(targets, probabilities, among, self.distribution, escape)
+        members = np.flatnonzero(among)
+        times: np.ndarray | None = np.zeros(len(targets))
+        if len(members):
+            times = _iterated_times(targets, probabilities, among, self.distribution, escape)
         if times is None:
-            members = np.flatnonzero(among)
+            found = passage_times(*_restricted(targets, probabilities, members), TOLERANCE)
+            if found is None:
+                raise ChainError(_unsettled(len(members)))
             times = np.zeros(len(targets))
-            times[members] = eliminated_times(*_dense(targets, probabilities, members))
+            times[members] = found
         times[endless] = math.inf
         times.flags.writeable = False
         return times
@@ -312,17 +316,19 @@ def _survive(targets, probabilities, rows, x, out):
         out[rows[k]] = total
 
 
-def _dense(
+def _restricted(
     targets: np.ndarray, probabilities: np.ndarray, members: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[csr_array, np.ndarray]:
     """Q among some states, which lead only to each other and to 0, and what falls from them."""
-    if len(members) > DENSE_LIMIT:
-        raise ChainError(
-            f"the chain does not settle in {_STEPS} steps, and with {len(members)} states it is "
-            f"too large to be solved otherwise (limit {DENSE_LIMIT})"
-        )
     rows = transition_matrix(targets, probabilities)[members]
-    return rows[:, members].toarray(), rows[:, [0]].toarray().ravel()
+    return csr_array(rows[:, members]), rows[:, [0]].toarray().ravel()
+
+
+def _unsettled(states: int) -> str:
+    return (
+        f"the chain of {states} states settles neither in {_STEPS} steps nor in {ROUNDS} rounds of "
+        "aggregation"
+    )
 
 
 class _Solver:
@@ -408,7 +414,7 @@ class _Solver:
         errors = {}
         for c in [*unsettled, *left]:
             try:
-                out[:, c] = self._squared(columns[c])
+                out[:, c] = self._aggregated(columns[c])
             except ChainError as error:
                 out[:, c] = 0.0
                 errors[int(c)] = error
@@ -432,7 +438,9 @@ class _Solver:
         x, out = aside.astype(np.float64), np.zeros(len(phi))
         for _ in range(_ASIDE_STEPS if lambda_2 > 0.0 else 0):
             _survive(self.targets, p, rows, x, out)
-            out /= lambda_2
+            # Beyond 1 a bound does not hide an eigenvector, of which x is never less than a copy.
+            with np.errstate(over="ignore"):
+                np.minimum(out / lambda_2, _MOST_SURVIVAL, out=out)
             x, out = out, x
             # The largest survival of k steps is at least the eigenvalue to the power of k. By more
             # than rounding adds to a survival of 1:
@@ -440,15 +448,14 @@ class _Solver:
                 return None
         return aside
 
-    def _squared(self, column: int) -> np.ndarray:
-        """Metastable distribution of one column, if the chain is small."""
-        p = self.probabilities[:, column]
+    def _aggregated(self, column: int) -> np.ndarray:
+        """Metastable distribution of one column, however slowly it mixes."""
         members = iteration.reachable(self.targets, self.slopes[column], max(1, self.safe[column]))
         members[0] = False
-        q, falls = _dense(self.targets, p, np.flatnonzero(members))
-        phi = squared_distribution(q, falls, TOLERANCE)
+        rows = _restricted(self.targets, self.probabilities[:, column], np.flatnonzero(members))
+        phi = metastable_distribution(*rows, TOLERANCE)
         if phi is None:
-            raise ChainError(f"a chain of {len(q)} states does not settle when squared")
+            raise ChainError(_unsettled(len(rows[1])))
         out = np.zeros(len(self.targets))
         out[members] = phi
         return out
@@ -574,7 +581,7 @@ def metastabilities(
     -------
     list of Metastability or ChainError
         One for each of `sigma_s`, in the same order. A `ChainError`, which is not raised, stands
-        where a chain mixes too slowly to be iterated and is too large to be solved otherwise.
+        where a chain mixes too slowly to be iterated, and aggregation does not settle either.
 
     Raises
     ------
