@@ -401,8 +401,8 @@ def trial_step(scheme, rob, par, w):
             five = five + _ERROR_5[k] * value
             three = three + _ERROR_3[k] * value
         before, after = abs(load(w, Y, i)), abs(load(w, Y_NEW, i))
-        scale = rob[r.TOLERANCE] * (1.0 + select(before > after, before, after))
-        five, three = five / scale, three / scale
+        weight = 1.0 / (rob[r.TOLERANCE] * (1.0 + select(before > after, before, after)))
+        five, three = five * weight, three * weight
         order_5 = order_5 + five * five
         order_3 = order_3 + three * three
     size = (order_5 + 0.01 * order_3) * STATES

@@ -182,10 +182,9 @@ def solve(rob, s, c, right):
     The torso and the swing tibia come first: they are coupled to few links.
     """
     i = r.I_LINK
-    d44 = rob[C + 24] + rob[i + 4]
+    over44, over33 = 1.0 / (rob[C + 24] + rob[i + 4]), 1.0 / (rob[C + 18] + rob[i + 3])
     d40 = rob[C + 20] * (c[4] * c[0] + s[4] * s[0])
     d42 = rob[C + 22] * (c[4] * c[2] + s[4] * s[2])
-    d33 = rob[C + 18] + rob[i + 3]
     d30 = rob[C + 15] * (c[3] * c[0] + s[3] * s[0])
     d31 = rob[C + 16] * (c[3] * c[1] + s[3] * s[1])
     d32 = rob[C + 17] * (c[3] * c[2] + s[3] * s[2])
@@ -194,30 +193,31 @@ def solve(rob, s, c, right):
     d02 = rob[C + 2] * (c[0] * c[2] + s[0] * s[2])
     d00, d11, d22 = rob[C] + rob[i], rob[C + 6] + rob[i + 1], rob[C + 12] + rob[i + 2]
 
-    l40, l42 = d40 / d44, d42 / d44
-    l30, l31, l32 = d30 / d33, d31 / d33, d32 / d33
+    l40, l42 = d40 * over44, d42 * over44
+    l30, l31, l32 = d30 * over33, d31 * over33, d32 * over33
     d00 = d00 - l40 * d40 - l30 * d30
     d02 = d02 - l40 * d42 - l30 * d32
     d22 = d22 - l42 * d42 - l32 * d32
     d11 = d11 - l31 * d31
     d10 = d10 - l31 * d30
     d12 = d12 - l31 * d32
-    inverse = 1.0 / d11
-    l10, l12 = d10 * inverse, d12 * inverse
+    over11 = 1.0 / d11
+    l10, l12 = d10 * over11, d12 * over11
     d00 = d00 - l10 * d10
     d02 = d02 - l10 * d12
     d22 = d22 - l12 * d12
-    l02 = d02 / d00
+    over00 = 1.0 / d00
+    l02 = d02 * over00
     d22 = d22 - l02 * d02
 
     y1 = right[1] - l31 * right[3]
     y0 = right[0] - l40 * right[4] - l30 * right[3] - l10 * y1
     y2 = right[2] - l42 * right[4] - l32 * right[3] - l12 * y1 - l02 * y0
     x2 = y2 / d22
-    x0 = y0 / d00 - l02 * x2
-    x1 = y1 * inverse - l10 * x0 - l12 * x2
-    x3 = right[3] / d33 - l30 * x0 - l31 * x1 - l32 * x2
-    x4 = right[4] / d44 - l40 * x0 - l42 * x2
+    x0 = y0 * over00 - l02 * x2
+    x1 = y1 * over11 - l10 * x0 - l12 * x2
+    x3 = right[3] * over33 - l30 * x0 - l31 * x1 - l32 * x2
+    x4 = right[4] * over44 - l40 * x0 - l42 * x2
     return (x0, x1, x2, x3, x4)
 
 
