@@ -78,6 +78,11 @@ def good(fake, request, answer, delay=0.001):
     later(delay, lambda: answer(right_answer(request)))
 
 
+def at_once(fake, request, answer):
+    """In the order of the requests, however late threads are."""
+    answer(right_answer(request))
+
+
 def silent(fake, request, answer):
     pass
 
@@ -191,7 +196,7 @@ def test_all_simulators_are_used_and_answers_are_in_order(swings, simulators):
 
 def test_jobs_share_the_simulators_and_end_side_by_side(swings):
     """A short one that comes while long ones run does not wait for them to end."""
-    fake = Fake(a=good, b=good)
+    fake = Fake(a=at_once, b=at_once)
     simulate = fan_out(fake)
     long = [job_of(swings), job_of(swings)]
     short = job_of((swings[0][:20], swings[1][:20]))
