@@ -665,7 +665,8 @@ class TestRun:
         assert not run_checkpoint(run).exists()
 
     def test_a_mesher_that_is_killed_is_replaced_and_the_mesh_goes_on(self, tmp_path, capsys):
-        arguments = ("--threshold", "0.003", "--sigma", "2")
+        # 27612 states: a second, of which the first tenth is enough to be seen.
+        arguments = ("--threshold", "1e-4", "--sigma", "2")
         more = ("--workers", "1", "--walks", "0", "--json", "--output", "run")
         run = Run(tmp_path, *arguments, *more)
         kept = run_checkpoint(run)
