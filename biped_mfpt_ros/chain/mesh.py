@@ -585,7 +585,8 @@ class MeshGrowth:
                 reached, self._clusters(_slope_indices(steps, m)), scales
             )
 
-        # The targets of one piece are independent of all others.
+        # The targets of one piece are independent of all others. The last test has left the grids
+        # for these scales, so that threads only read them.
         starts = [1]
         while (end := starts[-1] + self._answers.rows(starts[-1])) < n:
             starts.append(end)
