@@ -1,6 +1,8 @@
 """A mesher that is killed: the next one goes on where it was, and ends with the same mesh."""
 
+import math
 import signal
+import threading
 import time
 
 import numpy as np
@@ -24,15 +26,32 @@ IN_FLIGHT = 2
 
 
 class Counting(Simulator):
-    """Counts the states that it simulates, and takes its time for it."""
+    """Counts the states that it simulates, and takes its time for it; may be held."""
 
     count = largest = 0
+    hold_above = math.inf
+
+    def __init__(self, name=None):
+        super().__init__(name)
+        self.go_on = threading.Event()
 
     def _simulate(self, request, response):
+        if self.count > self.hold_above:
+            self.go_on.wait(60.0)
         self.count += len(request.previous_slopes)
         self.largest = max(self.largest, len(request.previous_slopes))
-        time.sleep(0.1)  # so that a mesh outlasts what is slow to end its mesher
+        time.sleep(0.1)  # so that a mesh outlasts what is slow to cancel it
         return super()._simulate(request, response)
+
+    def hold_after(self, more):
+        """Simulate that many more states, and no further request until released."""
+        self.go_on.clear()
+        self.hold_above = self.count + more
+
+    def release(self):
+        """Go on with what was held."""
+        self.hold_above = math.inf
+        self.go_on.set()
 
 
 @pytest.fixture
@@ -102,11 +121,16 @@ def test_mesher_killed_again_and_again_ends_with_the_same_mesh(
     for kill in range(kills):
         mesher = launch(graph, f"mesher_{kill}", tmp_path)
         answered = sum(s.count for s in simulators)
-        assert tester.send_goal_to(f"mesher_{kill}", goal).accepted
         more = int(rng.integers(n // 8, n // 6))
+        # However slow the mesher is to die, its mesh is not complete by then.
+        for simulator in simulators:
+            simulator.hold_after(more // 2)
+        assert tester.send_goal_to(f"mesher_{kill}", goal).accepted
         wait_for(lambda more=more, a=answered: sum(s.count for s in simulators) > a + more, "work")
         mesher.send_signal(sent)
         mesher.wait(10.0)
+        for simulator in simulators:
+            simulator.release()
         assert len(journals(tmp_path)) == 1, kill
     launch(graph, "mesher", tmp_path)
     handle = tester.send_goal_to("mesher", goal)
@@ -151,6 +175,34 @@ def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_
         assert status == GoalStatus.STATUS_SUCCEEDED, result.message
         assert result.swings_resumed == 0
         assert_same_mesh(tester.mesh(result.mesh_id), mesh_here)
+    assert journals(tmp_path) == []
+
+
+@pytest.mark.parametrize("topic", ["states", "transitions", "info"])
+def test_a_mesh_that_cannot_be_published_is_kept(graph, tester, goal, mesh_here, tmp_path, topic):
+    """As when the node is told to stop between two messages."""
+    graph.start(Simulator)
+    mesher = graph.start(Mesher, checkpoint_directory=str(tmp_path))
+    publisher = getattr(mesher._meshes, topic)
+    publish = publisher.publish
+
+    def fail_later(message):
+        early = {"states": lambda: message.generation < 2, "transitions": lambda: False,
+                 "info": lambda: message.status != MeshInfo.COMPLETE}  # fmt: skip
+        if not early[topic]():
+            raise RuntimeError("the publisher is invalid")
+        publish(message)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(publisher, "publish", fail_later)
+        status, result = tester.grow(goal)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "the publisher is invalid" in result.message
+    assert len(journals(tmp_path)) == 1
+    status, result = tester.grow(goal)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert result.swings_resumed > 0
+    assert_same_mesh(tester.mesh(result.mesh_id), mesh_here)
     assert journals(tmp_path) == []
 
 

@@ -221,11 +221,15 @@ class _Growing:
             except (InputError, NoLimitCycle, MeshLimitError) as error:
                 self._end(MeshInfo.FAILED, str(error))
             except Exception as error:
+                # It need not be the mesh's fault: nothing can be published once the node stops.
                 self._log_error("a mesh failed", error)
-                self._end(MeshInfo.FAILED, f"internal error of the mesher: {error!r}")
+                message = f"internal error of the mesher: {error!r}"
+                self._end(MeshInfo.FAILED, message, resumable=True)
         except Exception as error:
             # The other meshes go on.
             self.ended = True
+            if self._journal is not None:
+                self._journal.close()
             self._log_error("the end of a mesh could not be told", error)
         return None
 
@@ -305,9 +309,9 @@ class _Growing:
         self, status: int, message: str = "", mesh: Mesh | None = None, *, resumable: bool = False
     ) -> None:
         self.ended = True
-        if self._journal is not None:
-            self._journal.close(remove=not resumable)
         if not self._meshes.node.context.ok():
+            if self._journal is not None:
+                self._journal.close()
             return
         result = GrowMesh.Result(success=status == MeshInfo.COMPLETE, message=message)
         if self._mesh_id:
@@ -322,6 +326,9 @@ class _Growing:
             result.chunks_repeated = tally.chunks_repeated
             result.seconds = time.monotonic() - self._start
             result.step_map_seconds = tally.step_map_seconds
+        # Only now, since a mesh that nobody was told of would have to be grown again.
+        if self._journal is not None:
+            self._journal.close(remove=not resumable)
         log = self._meshes.node.get_logger()
         if status == MeshInfo.COMPLETE:
             log.info(
