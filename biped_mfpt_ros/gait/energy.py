@@ -7,7 +7,18 @@ wherever the power changes its sign; those are found afterwards.
 from __future__ import annotations
 
 from biped_mfpt_ros.gait.integrate import STAGES, interpolate
-from biped_mfpt_ros.gait.scratch import ENERGY, ESTIMATE, LOBE, MODE, STAGE, TURNS, WORK, Y_NEW, H
+from biped_mfpt_ros.gait.scratch import (
+    ENERGY,
+    ESTIMATE,
+    LOBE,
+    MODE,
+    STAGE,
+    TURNS,
+    WORK,
+    WORKS,
+    Y_NEW,
+    H,
+)
 from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.lanes import select, splat
 
@@ -25,6 +36,8 @@ def find_lobes(w, lane):
     The energy is the integral of the power's magnitude, which has a kink there. The powers at five
     stages give a polynomial; it is needed up to the kinks only, where its error matters little.
     """
+    if w[MODE, WORKS, lane] == 0.0:
+        return
     h = w[MODE, H, lane]
     for i in range(4):
         row = LOBE + i
@@ -74,8 +87,10 @@ def find_lobes(w, lane):
 
 @inner_kernel
 def energy_at(w, v, lane, at):
-    """Energy spent up to fractions of the step in lanes, J (eq. 36)."""
+    """Energy spent up to fractions of the step in lanes, J (eq. 36); 0 where none is wanted."""
     total = splat(v[ENERGY, lane])
+    if w[MODE, WORKS, lane] == 0.0:
+        return total
     for i in range(4):
         row = LOBE + i
         last = 0.0 * at
@@ -93,6 +108,8 @@ def energy_at(w, v, lane, at):
 def energy_at_end(w, v, lane, end):
     """The same at the end of the step, with its works in row Y_NEW."""
     total = v[ENERGY, lane]
+    if w[MODE, WORKS, lane] == 0.0:
+        return total
     for i in range(4):
         last = 0.0
         for k in range(4):

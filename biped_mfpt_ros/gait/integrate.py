@@ -47,6 +47,7 @@ from biped_mfpt_ros.gait.scratch import (
     TANGENTIAL,
     TURNS,
     WORK,
+    WORKS,
     Y_NEW,
     H,
     Y,
@@ -352,6 +353,12 @@ def _stage(scheme, rob, par, w, h, stage, into, columns, mode):
 
 
 @inner_kernel
+def columns_of(w):
+    """Columns that are integrated: the works, too, or the states alone."""
+    return SIZE if w[MODE, WORKS, 0] != 0.0 else STATES
+
+
+@inner_kernel
 def trial_step(scheme, rob, par, w):
     """Try a step in all lanes, from row Y, whose derivative stands in row STAGE, to row Y_NEW.
 
@@ -359,13 +366,14 @@ def trial_step(scheme, rob, par, w):
     """
     mode = mode_of_all(w)
     h = load(w, MODE, H)
+    columns = columns_of(w)
     least = h * 0.0 + math.inf
     most = -least
     normal = least
     over = most
     for stage in range(1, STAGES + 1):
-        columns = SIZE if stage == STAGES else STATES
-        wanted, force, s, c = _stage(scheme, rob, par, w, h, stage, Y_NEW, columns, mode)
+        taken = columns if stage == STAGES else STATES
+        wanted, force, s, c = _stage(scheme, rob, par, w, h, stage, Y_NEW, taken, mode)
         m = margin(rob, force)
         least = select(m < least, m, least)
         most = select(m > most, m, most)
@@ -383,7 +391,7 @@ def trial_step(scheme, rob, par, w):
     store(w, ESTIMATE, MOST, most)
     store(w, ESTIMATE, LEAST_NORMAL, normal)
     store(w, ESTIMATE, BEYOND, over)
-    for i in range(WORK, SIZE):
+    for i in range(WORK, columns):
         power = load(w, STAGE, i)
         low, high = power, power
         for stage in POWER_STAGES:
@@ -423,7 +431,7 @@ def take_step(w):
     good = load(w, MODE, GOOD) != 0.0
     for i in range(STATES):
         store(w, Y, i, select(good, load(w, Y_NEW, i), load(w, Y, i)))
-    for i in range(SIZE):
+    for i in range(columns_of(w)):
         store(w, STAGE, i, select(good, load(w, STAGE + STAGES, i), load(w, STAGE, i)))
 
 
@@ -432,7 +440,8 @@ def prepare_dense(scheme, rob, par, w):
     """Compute the dense output of the step just tried, in all lanes."""
     mode = mode_of_all(w)
     h = load(w, MODE, H)
-    for i in range(SIZE):
+    columns = columns_of(w)
+    for i in range(columns):
         end = load(w, Y_NEW, i)
         first = end - load(w, Y, i)
         second = h * load(w, STAGE, i) - first
@@ -441,7 +450,7 @@ def prepare_dense(scheme, rob, par, w):
         store(w, DENSE + 2, i, 2.0 * first - h * (load(w, STAGE, i) + load(w, STAGE + STAGES, i)))
     for stage in range(STAGES + 1, STAGES + 1 + DENSE_STAGES):
         _stage(scheme, rob, par, w, h, stage, SPARE, STATES, mode)
-    for i in range(SIZE):
+    for i in range(columns):
         rate = load(w, STAGE, i)
         t3, t4 = _DENSE[0, 0] * rate, _DENSE[1, 0] * rate
         t5, t6 = _DENSE[2, 0] * rate, _DENSE[3, 0] * rate

@@ -40,8 +40,8 @@ ROWS = DENSE + 7
 
 # Columns of MODE: signs of the torques cut off (4), whether the controller has switched (0 or 1),
 # length of the step (s), which outputs are in sliding mode (4, 0 or 1), whether the step just tried
-# is good (0 or 1).
-CUT, SWITCHED, H, SLIDES, GOOD = 0, 4, 5, 6, 10
+# is good (0 or 1); and whether works are integrated for the energy (0 or 1, the same in all lanes).
+CUT, SWITCHED, H, SLIDES, GOOD, WORKS = 0, 4, 5, 6, 10, 11
 # Columns of END: sines (5) and cosines (5) of the angles.
 SINES, COSINES = 0, 5
 # Columns of ESTIMATE: error over the tolerance and its eighth root, least and greatest margin

@@ -47,6 +47,7 @@ from biped_mfpt_ros.gait.ground import (
 from biped_mfpt_ros.gait.integrate import (
     DENSE_STAGES,
     STAGES,
+    columns_of,
     eighth_root,
     interpolate,
     prepare_dense,
@@ -101,7 +102,6 @@ from biped_mfpt_ros.gait.scratch import (
     SINCE,
     SINE,
     SINES,
-    SIZE,
     SLIDE,
     SLIDES,
     SLIDING,
@@ -550,7 +550,7 @@ def _growth(w, v, lane, h):
 def _cut_short(rob, w, v, lane, end):
     """End the step at a fraction of it."""
     at = splat(end)
-    for i in range(SIZE):
+    for i in range(columns_of(w)):
         w[Y_NEW, i, lane] = lane_of(interpolate(w, lane, i, at), 0)
     s, c = sines(lane_angles(w, Y_NEW, lane))
     for i in range(5):

@@ -9,7 +9,15 @@ from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.gait.ground import slopes_ahead, to_joint
-from biped_mfpt_ros.gait.scratch import AHEAD, OUTCOME, SAMPLES, VARIABLES, empty_scratch
+from biped_mfpt_ros.gait.scratch import (
+    AHEAD,
+    MODE,
+    OUTCOME,
+    SAMPLES,
+    VARIABLES,
+    WORKS,
+    empty_scratch,
+)
 from biped_mfpt_ros.gait.step import check_states
 from biped_mfpt_ros.gait.swing import SAMPLE_COLUMNS, advance, begin
 from biped_mfpt_ros.jit import kernel
@@ -26,6 +34,7 @@ _MOST_SAMPLES = 20_000
 def _traced(scheme, rob, par, state, previous, slope, next_state, samples):
     """Simulate one swing in lane 0; returns the outcome and how many samples were taken."""
     w, v = empty_scratch(), np.zeros((VARIABLES, LANES))
+    w[MODE, WORKS] = 1.0
     active = np.zeros(LANES, np.bool_)
     ahead = np.zeros((LANES, AHEAD, 1 + LANES))
     slopes_ahead(np.array([slope]), ahead[0])
