@@ -31,10 +31,8 @@ def right_answer(request):
     states = unpacked(request.states, "d").reshape(-1, 10)
     outcomes, following = step_map(states, unpacked(request.previous_slopes, "d"))
     response = SimulateSteps.Response(step_map=request.step_map)
-    zeros = np.zeros(outcomes.shape)
-    fill_response(
-        response, Steps(outcomes, following, zeros, zeros, zeros, 1e-4 * len(states), 1, 7), False
-    )
+    none = np.zeros((0, len(SLOPES)))
+    fill_response(response, Steps(outcomes, following, none, none, none, 1e-4 * len(states), 1, 7))
     return response
 
 

@@ -166,6 +166,18 @@ def test_one_swing_for_all_slopes_is_the_swings_for_each(name):
         assert np.array_equal(together.next_states[chosen], apart[i].next_states)
 
 
+@pytest.mark.parametrize("name", ["hzd/mfpt", "smc/mfpt"])
+def test_steps_are_the_same_without_their_measures(name):
+    control, states, previous = reachable(name, 1)
+    with_all = simulate_steps(control, states, previous, SLOPES)
+    without = simulate_steps(control, states, previous, SLOPES, measures=False)
+    assert without.outcomes.tobytes() == with_all.outcomes.tobytes()
+    assert without.next_states.tobytes() == with_all.next_states.tobytes()
+    assert without.evaluations == with_all.evaluations
+    for measured in (without.durations, without.step_lengths, without.energies):
+        assert measured.shape == (0, SLOPES.size)
+
+
 def test_impact_is_where_the_foot_meets_the_slope():
     """To 1e-9 s: the foot, faster than 0.1 m/s, is within 1e-10 m of the slope."""
     control, states, previous = reachable("hzd/mfpt")

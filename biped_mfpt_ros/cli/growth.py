@@ -67,7 +67,12 @@ class Growth:
         def chunk(start: int) -> tuple[np.ndarray, np.ndarray, float]:
             part = slice(start, start + _CHUNK)
             steps = simulate_steps(
-                self._controller, states[part], previous_slopes[part], self._slopes, self._model
+                self._controller,
+                states[part],
+                previous_slopes[part],
+                self._slopes,
+                self._model,
+                measures=False,
             )
             return steps.outcomes, steps.next_states, steps.seconds
 

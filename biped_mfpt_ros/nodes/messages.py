@@ -290,15 +290,14 @@ def steps_request_from(
     )
 
 
-def fill_response(response: SimulateSteps.Response, steps: Steps, measures: bool) -> None:
+def fill_response(response: SimulateSteps.Response, steps: Steps) -> None:
     """Put steps into the answer to a request."""
     response.success = True
     response.outcomes = packed(steps.outcomes, "B")
     response.next_states = packed(steps.next_states, "d")
-    if measures:
-        response.durations = packed(steps.durations, "d")
-        response.step_lengths = packed(steps.step_lengths, "d")
-        response.energies = packed(steps.energies, "d")
+    response.durations = packed(steps.durations, "d")
+    response.step_lengths = packed(steps.step_lengths, "d")
+    response.energies = packed(steps.energies, "d")
     response.seconds = steps.seconds
     response.integrator_steps = steps.integrator_steps
     response.evaluations = steps.evaluations

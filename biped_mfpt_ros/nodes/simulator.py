@@ -96,8 +96,9 @@ class Simulator(Node):
                 asked.slopes,
                 asked.model,
                 limits.max_evaluations,
+                request.measures,
             )
-            fill_response(response, steps, request.measures)
+            fill_response(response, steps)
         except InputError as error:
             response.message = str(error)
             self.get_logger().warning(f"refused a request: {error}", throttle_duration_sec=1.0)

@@ -71,7 +71,12 @@ class LocalBackend:
                 check()
                 part = slice(at, at + _CHUNK)
                 steps = simulate_steps(
-                    cycle.controller, states[part], previous[part], slopes, settings.model
+                    cycle.controller,
+                    states[part],
+                    previous[part],
+                    slopes,
+                    settings.model,
+                    measures=False,
                 )
                 outcomes.append(steps.outcomes)
                 following.append(steps.next_states)

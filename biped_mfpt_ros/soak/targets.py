@@ -102,9 +102,10 @@ def answer_request(random: Random) -> None:
         asked.slopes,
         asked.model,
         MOST_EVALUATIONS,
+        made.measures,
     )
     response = SimulateSteps.Response()
-    messages.fill_response(response, steps, made.measures)
+    messages.fill_response(response, steps)
     back = messages.steps_from(response, len(steps.outcomes), asked.slopes.size)
     check(back.outcomes.tobytes() == steps.outcomes.tobytes())
     check(back.next_states.tobytes() == steps.next_states.tobytes())

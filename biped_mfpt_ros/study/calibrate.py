@@ -166,7 +166,9 @@ def _chain(
     control, slopes = controller(job.controller), slope_set(slope_step_deg)
     try:
         mesh = grow_mesh(
-            lambda states, previous: simulate_steps(control, states, previous, slopes, model),
+            lambda states, previous: simulate_steps(
+                control, states, previous, slopes, model, measures=False
+            ),
             state,
             slopes,
             threshold,
