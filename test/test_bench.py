@@ -21,8 +21,8 @@ def test_short_benchmarks(capsys):
 def test_a_wrong_result_is_an_error(capsys, monkeypatch):
     true = step_map.simulate_steps
 
-    def wrong(*arguments):
-        steps = true(*arguments)
+    def wrong(*arguments, **named):
+        steps = true(*arguments, **named)
         tight = len(arguments) == 5 and arguments[4] is not None and arguments[4].tolerance < 1e-11
         steps.next_states[:] += 1e-3 * tight
         return steps

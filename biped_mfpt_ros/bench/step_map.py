@@ -116,6 +116,8 @@ def swings_of(
 ) -> tuple[Controller, WalkerModel, np.ndarray, np.ndarray, np.ndarray]:
     """The swings that `step_map` times, each down to its last impact, or to its fall.
 
+    Without those that fall at once.
+
     Returns
     -------
     tuple
@@ -125,6 +127,8 @@ def swings_of(
     control, model = controller(name), readings()[name].model
     _, states, previous = reached(control, model)
     durations = simulate_steps(control, states, previous, SLOPES, model).durations
+    begun = durations.max(axis=1) > 0.0
+    states, previous, durations = states[begun], previous[begun], durations[begun]
     last = durations.argmax(axis=1)
     ends = np.empty_like(states)
     for k, (state, behind, i) in enumerate(zip(states, previous, last, strict=True)):
@@ -167,6 +171,31 @@ def scipy_swings(name: str, repetitions: int) -> tuple[np.ndarray, int, float]:
     if not error <= 1e-3:
         raise BenchError(f"{name}: scipy ends {error:g} away")
     return timed(integrate, repetitions), len(starts), error
+
+
+def stiff_evaluations(name: str) -> tuple[float, float]:
+    """Evaluations a swing of scipy's LSODA at rtol 1e-6, the same right side, and its error.
+
+    LSODA turns to an implicit method where the motion is stiff, as near sigma = 0. What it needs
+    tells how much harder one control law is than another, whoever integrates it.
+    """
+    control, model, starts, ends, durations = swings_of(name)
+    rob, par = model.packed(), control.packed(model.robot)
+    work, rate, torques = empty_scratch(), np.empty(11), np.empty(4)
+
+    def derivative(t: float, y: np.ndarray) -> np.ndarray:
+        _derivative(control.code, rob, par, work, y, rate, torques)
+        return rate[:10].copy()
+
+    runs = [
+        solve_ivp(derivative, (0.0, duration), start, "LSODA", rtol=1e-6, atol=1e-9)
+        for start, duration in zip(starts, durations, strict=True)
+    ]
+    error = max(float(np.abs(run.y[:, -1] - e).max()) for run, e in zip(runs, ends, strict=True))
+    # The bounds about sigma = 0, which it has and the sliding mode has not, move rates by 2e-4.
+    if not error <= 1e-3:
+        raise BenchError(f"{name}: LSODA ends {error:g} away")
+    return sum(run.nfev for run in runs) / len(runs), error
 
 
 def rigid_body_error(name: str) -> list[float]:
@@ -302,4 +331,12 @@ def run(short: bool) -> Section:
             section.facts[f"{name}: error of MuJoCo at 1, 1/2, 1/4 ms"] = errors
         ratio = medians[f"smc/{label}"] / medians[name]
         section.ratios[f"smc_over_hzd: {label}"] = ratio
+        stiff = {}
+        for scheme in ("hzd", "smc"):
+            one = f"{scheme}/{label}"
+            stiff[scheme], error = stiff_evaluations(one)
+            section.facts[f"{one}: evaluations a swing of scipy LSODA, rtol 1e-6"] = stiff[scheme]
+            section.facts[f"{one}: error of scipy LSODA"] = error
+        ratio = stiff["smc"] / stiff["hzd"]
+        section.ratios[f"lsoda_evaluations_smc_over_hzd: {label}"] = ratio
     return section

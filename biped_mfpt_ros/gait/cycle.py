@@ -157,13 +157,7 @@ class _Search:
         """One step from each state; NoLimitCycle when that costs too much."""
         previous = np.full(len(states), behind)
         steps = simulate_steps(
-            self.controller,
-            states,
-            previous,
-            [self.slope],
-            self.model,
-            self._left,
-            measures=False,
+            self.controller, states, previous, [self.slope], self.model, self._left
         )
         self._left -= steps.evaluations
         if self._left <= 0:
