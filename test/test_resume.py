@@ -178,17 +178,21 @@ def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_
     assert journals(tmp_path) == []
 
 
-@pytest.mark.parametrize("topic", ["states", "transitions", "info"])
+@pytest.mark.parametrize("topic", ["states", "transitions", "info", "info of its end"])
 def test_a_mesh_that_cannot_be_published_is_kept(graph, tester, goal, mesh_here, tmp_path, topic):
     """As when the node is told to stop between two messages."""
     graph.start(Simulator)
     mesher = graph.start(Mesher, checkpoint_directory=str(tmp_path))
-    publisher = getattr(mesher._meshes, topic)
+    publisher = getattr(mesher._meshes, topic.split()[0])
     publish = publisher.publish
 
     def fail_later(message):
-        early = {"states": lambda: message.generation < 2, "transitions": lambda: False,
-                 "info": lambda: message.status != MeshInfo.COMPLETE}  # fmt: skip
+        early = {
+            "states": lambda: message.generation < 2,
+            "transitions": lambda: False,
+            "info": lambda: message.status != MeshInfo.COMPLETE,
+            "info of its end": lambda: message.status == MeshInfo.GROWING,
+        }
         if not early[topic]():
             raise RuntimeError("the publisher is invalid")
         publish(message)

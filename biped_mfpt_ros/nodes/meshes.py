@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
@@ -231,6 +232,11 @@ class _Growing:
             if self._journal is not None:
                 self._journal.close()
             self._log_error("the end of a mesh could not be told", error)
+            if self._meshes.node.context.ok():
+                # Who waits for the goal is told at least that.
+                with suppress(Exception):  # it may have ended
+                    self._goal.abort()
+                self._done(GrowMesh.Result(message=f"internal error of the mesher: {error!r}"))
         return None
 
     def _log_error(self, what: str, error: Exception) -> None:
