@@ -116,6 +116,7 @@ def test_definition_names_each_type_once():
         "MSG: biped_mfpt_msgs/MeshSettings",
         "MSG: biped_mfpt_msgs/Controller",
         "MSG: biped_mfpt_msgs/WalkerModel",
+        "MSG: biped_mfpt_msgs/Robot",
         "MSG: builtin_interfaces/Time",
     ]
 

@@ -1,10 +1,12 @@
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from biped_mfpt_msgs.msg import Controller as ControllerMsg
 from biped_mfpt_msgs.msg import MeshInfo, MeshStates, MeshTransitions
+from biped_mfpt_msgs.msg import MeshSettings as MeshSettingsMsg
 from biped_mfpt_msgs.msg import WalkerModel as WalkerModelMsg
 from biped_mfpt_msgs.srv import SimulateSteps
 from hypothesis import given
@@ -13,13 +15,14 @@ from hypothesis.extra import numpy as npst
 from rclpy.serialization import deserialize_message, serialize_message
 
 from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh
+from biped_mfpt_ros.cli.parser import make_parser
 from biped_mfpt_ros.control.controller import Controller, controller, controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.step import Steps
 from biped_mfpt_ros.nodes import messages
 from biped_mfpt_ros.nodes.assembly import IncompleteMesh, MeshAssembly
 from biped_mfpt_ros.nodes.messages import MeshSettings
-from biped_mfpt_ros.walker.robot import WalkerModel
+from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import slope_set
 
 NANS = [math.nan] * len(controller("hzd/base").parameters)
@@ -59,8 +62,8 @@ def test_strided_and_transposed_arrays_are_packed_row_major():
 @pytest.mark.parametrize("name", controller_names())
 def test_catalogue_controller_round_trip_and_by_name(name):
     walking = controller(name)
-    spelled_out = messages.controller_from(sent(messages.controller_message(walking)))
-    by_name = messages.controller_from(sent(ControllerMsg(name=name)))
+    spelled_out = messages.controller_from(sent(messages.controller_message(walking)), rabbit())
+    by_name = messages.controller_from(sent(ControllerMsg(name=name)), rabbit())
     for got in (spelled_out, by_name):
         assert (got.name, got.scheme) == (walking.name, walking.scheme)
         assert same_bits(got.parameters, walking.parameters)
@@ -69,7 +72,7 @@ def test_catalogue_controller_round_trip_and_by_name(name):
 def test_controller_with_infinite_limit_round_trip():
     base = controller("hzd/base")
     walking = Controller("mine", "hzd", np.append(base.parameters, np.inf))
-    got = messages.controller_from(sent(messages.controller_message(walking)))
+    got = messages.controller_from(sent(messages.controller_message(walking)), rabbit())
     assert same_bits(got.parameters, walking.parameters)
 
 
@@ -84,6 +87,22 @@ def test_controller_with_infinite_limit_round_trip():
 def test_model_round_trip(torque_limit, friction, slip_duration, time_limit, tolerance, frame):
     model = WalkerModel(torque_limit, friction, slip_duration, time_limit, tolerance, frame)
     assert messages.model_from(sent(messages.model_message(model))) == model
+
+
+def test_another_robot_goes_through_a_message():
+    model = WalkerModel(robot=replace(rabbit(), femur_length=0.45))
+    assert messages.model_from(sent(messages.model_message(model))) == model
+
+
+def test_messages_have_the_defaults_of_the_library():
+    assert messages.model_from(sent(WalkerModelMsg())) == WalkerModel()
+    wanted = MeshSettings(controller("hzd/base"), WalkerModel(), slope_set(5.0), 0.03)
+    sparse = MeshSettingsMsg(controller=ControllerMsg(name="hzd/base"), slopes=wanted.slopes)
+    got = messages.settings_from(sent(sparse))
+    for name in ("model", "clustered", "scale_refresh", "max_states", "initial_slope"):
+        assert getattr(got, name) == getattr(wanted, name), name
+    parser = make_parser().parse_args(["run"])
+    assert got.threshold == parser.threshold
 
 
 def settings(**changes):
@@ -139,6 +158,7 @@ def edit(message, path, value):
         ("model.friction", math.nan, "model.friction"),
         ("model.time_limit", math.inf, "model.time_limit"),
         ("model.friction_frame", "horizontal", "model.friction_frame"),
+        ("model.robot.gravity", 0.0, "model.robot.gravity"),
         ("slopes", [], "slopes"),
         ("slopes", [0.1, 0.0], "slopes[1]"),
         ("slopes", [0.0, math.nan], "slopes[1]"),
@@ -178,7 +198,7 @@ def test_bad_settings_are_named(path, value, field):
 )
 def test_bad_controllers_are_named(message, field):
     with pytest.raises(InputError) as caught:
-        messages.controller_from(message)
+        messages.controller_from(message, rabbit())
     assert caught.value.field == field
 
 
@@ -199,7 +219,7 @@ def request(n=3, m=5, **changes):
         (request(states=[0.0] * 11), (10, 100), "states"),
         (request(n=3), (2, 100), "states"),
         (request(n=3, m=5), (3, 14), "states"),
-        (request(model=WalkerModelMsg()), (10, 100), "model.torque_limit"),
+        (request(model=WalkerModelMsg(torque_limit=0.0)), (10, 100), "model.torque_limit"),
     ],
 )
 def test_bad_requests_are_named(bad, limits, field):

@@ -30,7 +30,7 @@ from biped_mfpt_ros.nodes.messages import MeshSettings, packed
 from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters, parameter
 from biped_mfpt_ros.nodes.qos import PROGRESS, RESULTS
 from biped_mfpt_ros.nodes.simulator import Simulator
-from biped_mfpt_ros.walker.robot import WalkerModel
+from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import slope_set
 
 BASE = controller("hzd/base")
@@ -133,7 +133,7 @@ def test_a_request_that_costs_too_much_is_answered_in_part(graph, tester, cycle_
     assert 1 <= done < 10
     got = messages.steps_from(response, done, len(SLOPES))
     expected = simulate_steps(
-        messages.controller_from(asked.controller), states[:done], np.zeros(done), SLOPES
+        messages.controller_from(asked.controller, rabbit()), states[:done], np.zeros(done), SLOPES
     )
     assert got.outcomes.tobytes() == expected.outcomes.tobytes()
     assert got.next_states.tobytes() == expected.next_states.tobytes()

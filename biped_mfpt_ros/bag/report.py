@@ -16,6 +16,7 @@ from biped_mfpt_ros.bag.reader import Bag
 from biped_mfpt_ros.bag.sequences import SequenceCheck, leading_sequence
 from biped_mfpt_ros.chain.markov import ChainError, metastability
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.models import model_values
 from biped_mfpt_ros.walker.outcome import Outcome
 
 _PACKAGE = "biped_mfpt_msgs/msg/"
@@ -325,7 +326,7 @@ def _mesh_report(
         problem=recorded.problem,
         controller=settings.controller.name if settings else "",
         scheme=settings.controller.scheme if settings else "",
-        model=_model(settings.model) if settings else {},
+        model=model_values(settings.model) if settings else {},
         slopes=len(settings.slopes) if settings else 0,
         threshold=settings.threshold if settings else 0.0,
         clustered=bool(settings and settings.clustered),
@@ -337,13 +338,6 @@ def _mesh_report(
         outcomes=outcomes,
         estimates=estimates,
     )
-
-
-def _model(model: Any) -> dict[str, Any]:
-    names = (
-        "torque_limit", "friction", "friction_frame", "slip_duration", "time_limit", "tolerance",
-    )  # fmt: skip
-    return {name: getattr(model, name) for name in names}
 
 
 def _label(code: int) -> str:

@@ -78,7 +78,7 @@ def mfpt(args: argparse.Namespace) -> None:
 
 def grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:
     """Grow the mesh that the options ask for; also what describes it, for JSON."""
-    controller, model = options.controller_of(args), options.model_of(args)
+    controller, model = options.walker_of(args)
     slopes = options.slopes_of(args)
     settings = options.mesh_settings(args)
     with work(args.quiet) as progress, Growth(controller, slopes, model, progress) as by:

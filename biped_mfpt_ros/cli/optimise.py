@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,8 +32,8 @@ def optimise(args: argparse.Namespace) -> None:
     if args.confirm is None:
         settings = _settings(args)
         name = args.study or "-".join(
-            [settings.start.name.replace("/", "-"), settings.searcher, f"{args.sigma:g}",
-             str(settings.seed)]
+            [re.sub(r"\W", "-", settings.start.name, flags=re.ASCII), settings.searcher,
+             f"{args.sigma:g}", str(settings.seed)]
         )  # fmt: skip
     else:
         store = Store(Path(args.store))
@@ -126,7 +127,7 @@ def _scoring(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _settings(args: argparse.Namespace) -> StudySettings:
-    start, model = options.controller_of(args), options.model_of(args)
+    start, model = options.walker_of(args)
     if args.as_spline:
         from biped_mfpt_ros.optimise.fit import as_spline
 

@@ -5,19 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from biped_mfpt_ros.control.controller import Controller, controller
+from biped_mfpt_ros.control.controller import SCHEMES, Controller, controller
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
+from biped_mfpt_ros.models import MODEL_FIELDS, in_order, model_values, robot_from_file
+from biped_mfpt_ros.walker.robot import Robot, WalkerModel
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG, slope_set
-
-_MODEL_OPTIONS = (
-    "torque_limit", "friction", "friction_frame", "slip_duration", "time_limit", "tolerance",
-)  # fmt: skip
 
 
 def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -25,22 +23,38 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
 
 
-def controller_of(args: argparse.Namespace) -> Controller:
-    """The controller that was asked for, of the catalogue or of a file."""
+def controller_of(args: argparse.Namespace, robot: Robot) -> Controller:
+    """The controller that was asked for, of the catalogue or of a file.
+
+    On a robot of a file it has another name, as the paper's numbers are none of its own.
+    """
     if args.controller_file is None:
-        return controller(args.controller)
-    made = controller_from_file(args.controller_file)
+        made = controller(args.controller)
+    else:
+        made = controller_from_file(args.controller_file, robot)
+    if args.robot_file is not None:
+        made = replace(made, name=f"{made.name} on {Path(args.robot_file).stem}")
     args.controller = made.name
     return made
 
 
-def controller_from_file(path: str) -> Controller:
-    """Controller of a JSON object with name, scheme and parameters; raises InputError."""
+def controller_from_file(path: str, robot: Robot) -> Controller:
+    """Controller of a JSON object with name, scheme and parameters; raises InputError.
+
+    The parameters are a list in the scheme's order, or an object of them by name.
+    """
     try:
         data = json.loads(Path(path).read_text())
-        made = Controller(str(data["name"]), data["scheme"], np.array(data["parameters"], float))
-        made.packed(rabbit())  # checks ranges
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        scheme, parameters = data["scheme"], data["parameters"]
+        if scheme not in SCHEMES:
+            raise InputError("scheme", scheme, "one of " + ", ".join(SCHEMES))
+        if isinstance(parameters, dict):
+            parameters = in_order(parameters, SCHEMES[scheme].parameters, "parameters")
+        made = Controller(str(data["name"]), scheme, np.array(parameters, float))
+        made.packed(robot)  # checks ranges
+    except InputError as error:
+        raise InputError(f"{path}: {error.field}", error.value, error.allowed) from None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = f"a JSON file with name, scheme and parameters ({error})"
         raise InputError("--controller-file", path, reason) from None
     return made
@@ -48,7 +62,16 @@ def controller_from_file(path: str) -> Controller:
 
 def model_of(args: argparse.Namespace) -> WalkerModel:
     """The walker's model."""
-    return WalkerModel(**given(args, *_MODEL_OPTIONS))
+    values = given(args, *MODEL_FIELDS)
+    if args.robot_file is not None:
+        values["robot"] = robot_from_file(args.robot_file)
+    return WalkerModel(**values)
+
+
+def walker_of(args: argparse.Namespace) -> tuple[Controller, WalkerModel]:
+    """The controller and the model that were asked for."""
+    model = model_of(args)
+    return controller_of(args, model.robot), model
 
 
 def slopes_of(args: argparse.Namespace) -> np.ndarray:
@@ -87,5 +110,5 @@ def described(controller: Controller, model: WalkerModel) -> dict[str, Any]:
     """What walked, for JSON."""
     return {
         "controller": controller.name,
-        "model": {name: getattr(model, name) for name in _MODEL_OPTIONS},
+        "model": model_values(model),
     }

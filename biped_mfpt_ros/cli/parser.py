@@ -134,7 +134,12 @@ def _parents() -> dict[str, Parser]:
     walker.add_argument(
         "--controller-file",
         metavar="FILE",
-        help="take it from a JSON file instead, as `biped-mfpt study export` writes it",
+        help="take it from a JSON file instead, as `biped-mfpt controllers NAME` prints it",
+    )
+    walker.add_argument(
+        "--robot-file",
+        metavar="FILE",
+        help="JSON file with masses, lengths and inertias, see docs/robot.md (default: RABBIT)",
     )
     walker.add_argument(
         "--torque-limit",
@@ -661,7 +666,8 @@ again goes on where it was stopped, and is done at once when nothing is missing.
 settings, or of another step map, are computed anew.
 
 The directory then holds report.html (one file, with all pictures), report.json, a .csv for each
-table and figure, results/, bags/ and logs/. On two cores it takes 10 minutes, 1 with --quick.
+table and figure, results/, bags/ and logs/. On two idle cores it takes 2 minutes, half of one with
+--quick.
 
 examples:
   biped-mfpt reproduce
@@ -862,13 +868,20 @@ examples:
         "whole bag, and read that; BAG stays as it is",
     )
 
-    add(
+    controllers = add(
         "controllers",
         "single:controllers",
         "list the controllers: those of the paper with its figures, and others",
-        "",
+        """
+With NAME print one of them as --controller-file takes it, to be changed.
+
+examples:
+  biped-mfpt controllers
+  biped-mfpt controllers hzd/mfpt > mine.json
+""",
         "output",
     )
+    controllers.add_argument("name", nargs="?", metavar="NAME", help="print this one as JSON")
 
     node = commands.add_parser(
         "node",

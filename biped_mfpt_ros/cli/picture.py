@@ -33,7 +33,7 @@ def picture(args: argparse.Namespace) -> None:
     if not args.json:
         print(f"{made.title}\n{made.caption}\nwritten to {output}")
         return
-    controller, model = options.controller_of(args), options.model_of(args)
+    controller, model = options.walker_of(args)
     print(
         json_text(
             options.described(controller, model)
@@ -44,7 +44,7 @@ def picture(args: argparse.Namespace) -> None:
 
 
 def _of_walk(args: argparse.Namespace) -> Picture:
-    controller, model = options.controller_of(args), options.model_of(args)
+    controller, model = options.walker_of(args)
     mean, sigma = options.slope("--mean", args.mean), options.spread("--sigma", args.sigma)
     with work(args.quiet):
         cycle = find_limit_cycle(controller, 0.0, model)

@@ -24,7 +24,7 @@ from biped_mfpt_ros.cli.kernels import compile_all
 from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.processes import Child, Processes
-from biped_mfpt_ros.cli.results import estimate_row, mfpt_table, monte_carlo_result
+from biped_mfpt_ros.cli.results import beside_paper, estimate_row, mfpt_table, monte_carlo_result
 from biped_mfpt_ros.cli.shared_memory import remove_left_segments
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
@@ -51,7 +51,7 @@ _PICTURE_STEPS = 6
 def run(args: argparse.Namespace) -> None:
     """Run the pipeline, compare with the paper, keep everything in a directory."""
     # All that may be wrong is found before anything is started or written.
-    controller, model = options.controller_of(args), options.model_of(args)
+    controller, model = options.walker_of(args)
     slopes = options.slopes_of(args)
     mean = options.mean_of(args)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
@@ -63,7 +63,8 @@ def run(args: argparse.Namespace) -> None:
     ):
         if value < least:
             raise InputError(option, value, f"a whole number >= {least}")
-    name = f"{time.strftime('%Y%m%d-%H%M%S')}-{controller.name.replace('/', '-')}"
+    label = re.sub(r"\W", "-", controller.name, flags=re.ASCII)
+    name = f"{time.strftime('%Y%m%d-%H%M%S')}-{label}"
     namespace = _namespace(args.namespace or f"run_{name}_{os.getpid()}")
     require_ros()
     from biped_mfpt_ros.nodes.analysis import AnalysisParameters
@@ -434,12 +435,11 @@ def _report(result: dict[str, Any]) -> str:
                 )
             )
         headers = ("sigma", "Monte Carlo", "95 % confidence", "paper", "difference")
-        parts.append(table(headers, rows))
-    if any(row["paper"] is not None for row in result["estimates"]):
-        parts.append(
-            "A coarse mesh errs, ours and the paper's. Its MFPT settles as --threshold shrinks;\n"
-            "where the robot falls soon enough, `biped-mfpt monte-carlo` is the judge."
-        )
+        parts.append(table(*beside_paper(headers, rows)))
+    parts.append(
+        "A coarse mesh errs, ours and the paper's. Its MFPT settles as --threshold shrinks;\n"
+        "where the robot falls soon enough, `biped-mfpt monte-carlo` is the judge."
+    )
     parts.append(
         "\n".join(f"{name:<8} {path}" for name, path in result["files"].items() if name != "result")
     )

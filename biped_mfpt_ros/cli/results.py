@@ -70,4 +70,15 @@ def mfpt_table(estimates: Sequence[dict[str, Any]]) -> str:
                 ", ".join(falls),
             )
         )
-    return table(("sigma", "MFPT in steps", "paper", "difference", "falls"), rows)
+    return table(*beside_paper(("sigma", "MFPT in steps", "paper", "difference", "falls"), rows))
+
+
+def beside_paper(
+    header: Sequence[str], rows: Sequence[Sequence[Any]]
+) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+    """Header and rows of a table, without the paper's columns where it has no number."""
+    at = header.index("paper")
+    if any(row[at] is not None for row in rows):
+        return header, rows
+    kept = [i for i, name in enumerate(header) if name not in ("paper", "difference")]
+    return [header[i] for i in kept], [[row[i] for i in kept] for row in rows]

@@ -10,7 +10,14 @@ from biped_mfpt_ros.cli import options
 from biped_mfpt_ros.cli.kernels import work
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.results import monte_carlo_result, shares_table
-from biped_mfpt_ros.control.controller import catalogue, confirmed, origin, paper_controller_names
+from biped_mfpt_ros.control.controller import (
+    SCHEMES,
+    catalogue,
+    confirmed,
+    origin,
+    paper_controller_names,
+)
+from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo as walk
 from biped_mfpt_ros.gait.step import check_states, simulate_steps
@@ -21,7 +28,7 @@ from biped_mfpt_ros.walker.outcome import Outcome
 
 def step(args: argparse.Namespace) -> None:
     """Simulate one step."""
-    controller, model = options.controller_of(args), options.model_of(args)
+    controller, model = options.walker_of(args)
     previous = options.slope("--previous-slope", args.previous_slope)
     slope = options.slope("--slope", args.slope)
     states = check_states([args.state])
@@ -52,7 +59,7 @@ def step(args: argparse.Namespace) -> None:
 
 def cycle(args: argparse.Namespace) -> None:
     """Find a limit cycle."""
-    controller, model = options.controller_of(args), options.model_of(args)
+    controller, model = options.walker_of(args)
     slope = options.slope("--slope", args.slope)
     with work(args.quiet):
         found = find_limit_cycle(controller, slope, model)
@@ -90,7 +97,7 @@ def cycle(args: argparse.Namespace) -> None:
 
 def monte_carlo(args: argparse.Namespace) -> None:
     """Walk on random slopes until the fall."""
-    controller, model = options.controller_of(args), options.model_of(args)
+    controller, model = options.walker_of(args)
     mean, sigma = options.slope("--mean", args.mean), options.spread("--sigma", args.sigma)
     with work(args.quiet) as progress:
         result = walk(
@@ -128,7 +135,16 @@ def monte_carlo(args: argparse.Namespace) -> None:
 
 
 def controllers(args: argparse.Namespace) -> None:
-    """List the catalogue."""
+    """List the catalogue, or print one controller of it."""
+    if args.name is not None:
+        try:
+            one = catalogue()[args.name]
+        except KeyError:
+            raise InputError("NAME", args.name, "one of " + ", ".join(catalogue())) from None
+        parameters = dict(zip(SCHEMES[one.scheme].parameters, one.parameters, strict=True))
+        # Not the catalogue's name: what is changed has none of the paper's numbers.
+        print(json_text({"name": "mine", "scheme": one.scheme, "parameters": parameters}))
+        return
     papers = paper_controller_names()
     rows = [paper.figures(name) for name in papers]
     others = [

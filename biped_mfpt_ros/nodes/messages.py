@@ -24,8 +24,9 @@ from biped_mfpt_ros.chain.mesh import DEFAULT_MAX_STATES, SCALE_REFRESHES, Mesh
 from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.step import Steps, check_states
+from biped_mfpt_ros.models import ROBOT_FIELDS, robot_from
 from biped_mfpt_ros.walker.outcome import Outcome
-from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel, rabbit
+from biped_mfpt_ros.walker.robot import STATE_SIZE, Robot, WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import check_slopes
 
 if TYPE_CHECKING:  # a simulator needs no chain, and importing it takes a fifth of its start
@@ -89,8 +90,8 @@ def controller_message(walking: Controller) -> msg.Controller:
     )
 
 
-def controller_from(message: msg.Controller, name: str = "controller") -> Controller:
-    """Controller of a message: one of the catalogue if it has a name but no parameters.
+def controller_from(message: msg.Controller, robot: Robot, name: str = "controller") -> Controller:
+    """Controller of a message, for a robot: one of the catalogue if it has no parameters.
 
     Raises
     ------
@@ -106,21 +107,20 @@ def controller_from(message: msg.Controller, name: str = "controller") -> Contro
             raise InputError(f"{name}.scheme", message.scheme, f"{named.scheme} or empty")
         return named
     with _inside(name):
-        return _checked(message.name, message.scheme, unpacked(message.parameters, "d").tobytes())
+        parameters = unpacked(message.parameters, "d").tobytes()
+        return _checked(message.name, message.scheme, parameters, robot)
 
 
 @lru_cache(maxsize=8)
-def _checked(name: str, scheme: str, parameters: bytes) -> Controller:
+def _checked(name: str, scheme: str, parameters: bytes, robot: Robot) -> Controller:
     """A controller that can be used. A mesh asks for the same one again and again."""
     made = Controller(name, scheme, np.frombuffer(parameters))
-    made.packed(rabbit())  # checks ranges
+    made.packed(robot)  # checks ranges
     return made
 
 
 def model_message(model: WalkerModel) -> msg.WalkerModel:
-    """Walker model as a message. Its robot must be RABBIT: messages carry no links."""
-    if model.robot != rabbit():
-        raise InputError("model.robot", model.robot, "RABBIT")
+    """Walker model as a message."""
     return msg.WalkerModel(
         torque_limit=float(model.torque_limit),
         friction=float(model.friction),
@@ -128,6 +128,7 @@ def model_message(model: WalkerModel) -> msg.WalkerModel:
         time_limit=float(model.time_limit),
         tolerance=float(model.tolerance),
         friction_frame=model.friction_frame,
+        robot=msg.Robot(**{name: float(getattr(model.robot, name)) for name in ROBOT_FIELDS}),
     )
 
 
@@ -141,7 +142,13 @@ def model_from(message: msg.WalkerModel, name: str = "model") -> WalkerModel:
             time_limit=message.time_limit,
             tolerance=message.tolerance,
             friction_frame=message.friction_frame or "slope",
+            robot=_robot_from(message.robot),
         )
+
+
+def _robot_from(message: msg.Robot) -> Robot:
+    values = {name: getattr(message, name) for name in ROBOT_FIELDS}
+    return robot_from(values) if any(values.values()) else rabbit()
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,9 +234,10 @@ def settings_from(message: msg.MeshSettings, name: str = "settings") -> MeshSett
     """Mesh settings of a message; raises InputError."""
     with _inside(name):
         initial = unpacked(message.initial_state, "d")
+        model = model_from(message.model)
         return MeshSettings(
-            controller=controller_from(message.controller),
-            model=model_from(message.model),
+            controller=controller_from(message.controller, model.robot),
+            model=model,
             slopes=unpacked(message.slopes, "d").copy(),
             threshold=message.threshold,
             clustered=message.clustered,
@@ -281,9 +289,10 @@ def steps_request_from(
         raise InputError(
             "states", f"{n} states times {slopes.size} slopes", f"at most {most_outcomes} outcomes"
         )
+    model = model_from(request.model)
     return StepsRequest(
-        controller_from(request.controller),
-        model_from(request.model),
+        controller_from(request.controller, model.robot),
+        model,
         states,
         unpacked(request.previous_slopes, "d"),
         slopes,

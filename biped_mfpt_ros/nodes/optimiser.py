@@ -248,7 +248,8 @@ def settings_from(request: Optimise.Goal) -> StudySettings:
     for name in ("step", "check_steps", "check_walks", "trial_seconds", "searcher"):
         if getattr(request, name):
             given[name] = getattr(request, name)
-    start, model = controller_from(request.start, "start"), model_from(request.model)
+    model = model_from(request.model)
+    start = controller_from(request.start, model.robot, "start")
     if request.candidates:
         n = len(SearchSpace(start, model.robot, request.fixed))
         rows = unpacked_rows(request.candidates, "d", n, "candidates")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.models import model_from, model_values
 from biped_mfpt_ros.optimise.searchers import SEARCHERS
 from biped_mfpt_ros.walker.robot import WalkerModel
 from biped_mfpt_ros.walker.terrain import slope_set
@@ -31,8 +32,6 @@ LIMITS = {
     "step_length_max": "m, on flat ground",
 }
 """Constraints that a study may have."""
-
-MODEL_FIELDS = tuple(f.name for f in fields(WalkerModel) if f.name != "robot")
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ class StudySettings:
         start = {"name": self.start.name, "scheme": self.start.scheme}
         out = {name: getattr(self, name) for name in self.__dataclass_fields__}
         out["start"] = start | {"parameters": self.start.parameters.tolist()}
-        out["model"] = {name: _text(getattr(self.model, name)) for name in MODEL_FIELDS}
+        out["model"] = {name: _text(value) for name, value in model_values(self.model).items()}
         out["stages"] = [{k: _text(v) for k, v in asdict(s).items()} for s in self.stages]
         if not self.candidates:  # a study that was begun before there were any goes on
             del out["candidates"]
@@ -192,8 +191,8 @@ class StudySettings:
         start = data["start"]
         given = dict(data)
         given["start"] = Controller(start["name"], start["scheme"], np.array(start["parameters"]))
-        model: dict[str, Any] = {k: math.inf if v == "inf" else v for k, v in data["model"].items()}
-        given["model"] = WalkerModel(**model)
+        model = {k: math.inf if v == "inf" else v for k, v in data["model"].items()}
+        given["model"] = model_from(model)
         given["stages"] = tuple(
             Stage(float(s["slope_step_deg"]), float(s["threshold"]), float(s["margin"]),
                   int(s["max_states"])) for s in data["stages"]

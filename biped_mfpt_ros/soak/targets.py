@@ -457,7 +457,7 @@ def read_command_line(random: Random) -> None:
             return
     given = vars(args)
     if "controller" in given:
-        walking, model = options.controller_of(args), options.model_of(args)
+        walking, model = options.walker_of(args)
     for name in ("slope", "previous_slope", "mean"):
         if given.get(name) is not None:
             check(math.isfinite(options.slope(f"--{name}", given[name])))

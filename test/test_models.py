@@ -1,0 +1,103 @@
+"""Walker models as plain values, and the files of an own robot and controller."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from biped_mfpt_ros.cli import main
+from biped_mfpt_ros.control.controller import SCHEMES, controller
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.models import model_from, model_values, robot_from, robot_from_file
+from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
+
+RABBIT = dataclasses.asdict(rabbit())
+HEAVY = dataclasses.replace(rabbit(), tibia_mass=3.6)
+
+
+def test_values_give_the_same_model_back():
+    for model in (WalkerModel(friction=0.7), WalkerModel(robot=HEAVY)):
+        assert model_from(json.loads(json.dumps(model_values(model)))) == model
+    # A study of RABBIT that was begun before there were other robots goes on.
+    assert "robot" not in model_values(WalkerModel())
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        (RABBIT | {"torso_mass": -1.0}, "torso_mass"),
+        (RABBIT | {"gravity": float("nan")}, "gravity"),
+        (RABBIT | {"femur_inertia": 0}, "femur_inertia"),
+        (RABBIT | {"tibia_com": float("inf")}, "tibia_com"),
+        (RABBIT | {"femur_length": "0.4"}, "femur_length"),
+        (RABBIT | {"femur_length": True}, "femur_length"),
+        (RABBIT | {"femur_length": 10**400}, "femur_length"),
+        (RABBIT | {"arm_mass": 1.0}, "arm_mass"),
+        ({k: v for k, v in RABBIT.items() if k != "gravity"}, "gravity"),
+    ],
+)
+def test_a_bad_robot_is_refused_by_the_name_of_its_value(values, field):
+    with pytest.raises(InputError) as error:
+        robot_from(values)
+    assert error.value.field == f"robot.{field}"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "3", '{"torso_mass": ', "[" * 100000, "\xff"])
+def test_a_file_that_holds_no_robot_is_refused(tmp_path, text):
+    path = tmp_path / "robot.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError):
+        robot_from_file(path)
+
+
+def test_own_robot_and_controller_walk_as_they_do_in_the_library(tmp_path, capsys):
+    robot, mine = tmp_path / "heavy.json", tmp_path / "mine.json"
+    robot.write_text(json.dumps(dataclasses.asdict(HEAVY)))
+    assert main(["controllers", "hzd/mfpt"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert tuple(data["parameters"]) == SCHEMES["hzd"].parameters
+    data["parameters"]["kp"] = 200.0
+    mine.write_text(json.dumps(data))
+    command = ["cycle", "--robot-file", str(robot), "--controller-file", str(mine), "--json"]
+    assert main(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    parameters = controller("hzd/mfpt").parameters.copy()
+    parameters[0] = 200.0
+    own = dataclasses.replace(controller("hzd/mfpt"), parameters=parameters)
+    wanted = find_limit_cycle(own, 0.0, WalkerModel(robot=HEAVY))
+    assert found["state"] == wanted.state.tolist()
+    assert found["controller"] == "mine on heavy"
+    assert found["model"]["robot"] == dataclasses.asdict(HEAVY)
+    # Another robot walks otherwise.
+    rabbits = find_limit_cycle(own, 0.0, WalkerModel()).state
+    assert not np.allclose(rabbits, wanted.state, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"parameters": {"kp": 1.0}}, "parameters.alpha_0^1"),
+        ({"parameters": {}, "scheme": "pid"}, "scheme"),
+        ({"parameters": [1.0]}, "length 1"),
+    ],
+)
+def test_a_bad_controller_file_is_refused_with_the_field(tmp_path, capsys, change, said):
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({"name": "mine", "scheme": "hzd"} | change))
+    assert main(["cycle", "--controller-file", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert str(path) in error
+    assert said in error
+
+
+def test_a_run_takes_a_controller_of_any_name(tmp_path, capsys):
+    path = tmp_path / "mine.json"
+    parameters = controller("hzd/base").parameters.tolist()
+    path.write_text(json.dumps({"name": "my gait!", "scheme": "hzd", "parameters": parameters}))
+    # Refused for its threshold, which is checked after the names made of the controller's.
+    assert main(["run", "--controller-file", str(path), "--threshold", "-1"]) == 2
+    assert capsys.readouterr().err.startswith("biped-mfpt run: error: --threshold: -1.0")
