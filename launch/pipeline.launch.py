@@ -4,10 +4,10 @@ ros2 launch biped_mfpt_ros pipeline.launch.py workers:=4
 """
 
 import os
+from typing import Any
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -15,24 +15,35 @@ from launch_ros.parameter_descriptions import ParameterValue
 PACKAGE = "biped_mfpt_ros"
 
 
-def simulators(context: LaunchContext) -> list[Node]:
-    """As many simulators as asked for. They choose their own names, so that none is used twice."""
-    text = LaunchConfiguration("workers").perform(context)
-    if not text.isdecimal() or int(text) < 1:
-        raise ValueError(f"workers: {text!r} is not allowed; allowed: a whole number from 1")
+def nodes(context: LaunchContext) -> list[Node]:
+    """All nodes, the simulators first: an error there comes before anything runs."""
+    value = {
+        name: LaunchConfiguration(name).perform(context)
+        for name in ("workers", "record", "bag", "namespace", "params_file")
+    }
+    workers = value["workers"]
+    if not workers.isdecimal() or int(workers) < 1:
+        raise ValueError(f"workers: {workers!r} is not allowed; allowed: a whole number from 1")
+    parameters: list[Any] = [value["params_file"]] if value["params_file"] else []
+    # Without its type a name such as 2024 would become a number.
+    bag = [{"bag": ParameterValue(value["bag"], value_type=str)}] if value["bag"] else []
+    # Simulators choose their own names, so that none is used twice.
+    names = ["simulator"] * int(workers) + ["mesher", "analysis", "optimiser"]
+    if value["record"] == "true":
+        names.append("recorder")
     return [
         Node(
             package=PACKAGE,
-            executable="simulator",
-            namespace=LaunchConfiguration("namespace"),
+            executable=name,
+            namespace=value["namespace"],
+            parameters=parameters + bag if name == "recorder" else parameters,
             output="screen",
         )
-        for _ in range(int(text))
+        for name in names
     ]
 
 
 def generate_launch_description() -> LaunchDescription:
-    namespace = LaunchConfiguration("namespace")
     arguments = [
         DeclareLaunchArgument(
             "workers",
@@ -54,19 +65,10 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "namespace", default_value="", description="namespace of all nodes; empty: none"
         ),
+        DeclareLaunchArgument(
+            "params_file",
+            default_value="",
+            description="YAML file with parameters of the nodes; empty: none",
+        ),
     ]
-    recorder = Node(
-        package=PACKAGE,
-        executable="recorder",
-        namespace=namespace,
-        # Without its type a name such as 2024 would become a number.
-        parameters=[{"bag": ParameterValue(LaunchConfiguration("bag"), value_type=str)}],
-        condition=IfCondition(LaunchConfiguration("record")),
-        output="screen",
-    )
-    others = [
-        Node(package=PACKAGE, executable=name, namespace=namespace, output="screen")
-        for name in ("mesher", "analysis", "optimiser")
-    ]
-    # The simulators first: an error there comes before anything runs.
-    return LaunchDescription([*arguments, OpaqueFunction(function=simulators), recorder, *others])
+    return LaunchDescription([*arguments, OpaqueFunction(function=nodes)])
