@@ -13,7 +13,8 @@ import numpy as np
 from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import STEP_MAP
-from biped_mfpt_ros.study.readings import readings, settings_of
+from biped_mfpt_ros.models import model_values
+from biped_mfpt_ros.study.readings import readings
 from biped_mfpt_ros.walker.robot import WalkerModel
 
 SEED = 1
@@ -117,7 +118,7 @@ class Job:
             "kind": self.kind,
             "controller": self.controller,
             "parameters": hashlib.sha256(values.tobytes()).hexdigest()[:16],
-            "model": {k: repr(v) for k, v in settings_of(model).items()},
+            "model": {k: repr(v) for k, v in model_values(model).items()},
             "settings": self.settings,
             "step_map": STEP_MAP,
         }

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.models import MODEL_FIELDS, model_values
 from biped_mfpt_ros.walker.robot import WalkerModel
-
-_SETTINGS = tuple(field.name for field in fields(WalkerModel) if field.name != "robot")
 
 
 @dataclass(frozen=True)
@@ -43,12 +42,7 @@ class Reading:
     @property
     def settings(self) -> dict[str, Any]:
         """The model's settings by name, SI units."""
-        return settings_of(self.model)
-
-
-def settings_of(model: WalkerModel) -> dict[str, Any]:
-    """Settings of a model by name, SI units; the links are RABBIT's."""
-    return {name: getattr(model, name) for name in _SETTINGS}
+        return model_values(self.model)
 
 
 @cache
@@ -64,8 +58,10 @@ def readings() -> dict[str, Reading]:
     out = {}
     for name, row in data["controllers"].items():
         settings = {k: math.inf if v == "none" else v for k, v in row["model"].items()}
-        unknown = [key for key in settings if key not in _SETTINGS]
+        unknown = [key for key in settings if key not in MODEL_FIELDS]
         if unknown:
-            raise InputError(f"readings.json: {name}", unknown[0], "one of " + ", ".join(_SETTINGS))
+            raise InputError(
+                f"readings.json: {name}", unknown[0], "one of " + ", ".join(MODEL_FIELDS)
+            )
         out[name] = Reading(name, WalkerModel(**settings), row["reason"], row["source"])
     return out
