@@ -8,19 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cmaes import CMA
 from scipy.optimize import minimize
 
+from biped_mfpt_ros.cli.study import run_rows
 from biped_mfpt_ros.control import hzd
 from biped_mfpt_ros.control.controller import catalogue, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise import store as store_module
 from biped_mfpt_ros.optimise import study as study_module
 from biped_mfpt_ros.optimise.scoring import Evaluation, Stopped
-from biped_mfpt_ros.optimise.searchers import SEARCHERS, Told, make_searcher
+from biped_mfpt_ros.optimise.searchers import SEARCHERS, CmaEs, Told, make_searcher
 from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.space import SearchSpace
 from biped_mfpt_ros.optimise.store import Store
-from biped_mfpt_ros.optimise.study import Study, confirming
+from biped_mfpt_ros.optimise.study import Study, best_trial, confirming
 from biped_mfpt_ros.report.studies import front
 from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 
@@ -93,8 +95,11 @@ def told(x):
     return Told(-quadratic(x), (quadratic(x), float(np.abs(x).sum())), 0.0)
 
 
+BOUNDS = np.array([[-5.0, 5.0]] * 4)
+
+
 def searched(name, most, seed=3, objectives=2):
-    searcher = make_searcher(name, np.array([[-5.0, 5.0]] * 4), seed=seed, objectives=objectives)
+    searcher = make_searcher(name, BOUNDS, seed=seed, objectives=objectives)
     asked = []
     while sum(map(len, asked)) < most and not searcher.done:
         vectors = searcher.ask()
@@ -123,6 +128,43 @@ def test_searcher_starts_at_the_start_and_is_reproducible(name):
 def test_searcher_finds_the_optimum(name, within):
     found, _ = searched(name, 2000)
     assert min(map(quadratic, found)) < within
+
+
+def generations(runs, number):
+    """Of CMA-ES: run, candidates and best score of each."""
+    searcher = make_searcher("cma-es", BOUNDS, seed=3, runs=runs, population=4)
+    out = []
+    for _ in range(number):
+        run, vectors = searcher.run, searcher.ask()
+        scores = [told(x) for x in vectors]
+        searcher.tell(vectors, scores)
+        out.append((run, vectors.tobytes(), max(one.score for one in scores)))
+    return out[1:]  # without the start
+
+
+def test_the_better_runs_of_cma_es_go_on():
+    found = generations(5, 300)
+    left = [1, 2, 3, 4, 5]
+    for wanted in (3, 2, 1):  # the better half, and the one in the middle
+        heat, found = found[: CmaEs.HEAT * len(left)], found[CmaEs.HEAT * len(left) :]
+        assert [run for run, _, _ in heat] == left * CmaEs.HEAT
+        so_far = {run: max(s for r, _, s in generations(5, 300)[: 300 - 1 - len(found)] if r == run)
+                  for run in left}  # fmt: skip
+        left = sorted(sorted(left, key=so_far.__getitem__)[-wanted:])
+    assert len(found) > CmaEs.HEAT
+    assert {run for run, _, _ in found} == set(left)
+
+
+def test_runs_of_cma_es_differ_and_the_first_is_that_of_a_search_of_one():
+    found = generations(3, 1 + 3 * CmaEs.HEAT)
+    runs = [[vectors for r, vectors, _ in found if r == run] for run in (1, 2, 3)]
+    assert len({*map(tuple, runs)}) == 3
+    alone = [vectors for _, vectors, _ in generations(1, 1 + CmaEs.HEAT)]
+    assert runs[0] == alone
+    # Studies of a time when there was but one go on: its random numbers are the same.
+    seed = int(np.random.SeedSequence([3, 0]).generate_state(1)[0])
+    cma = CMA(np.zeros(4), 1.0, BOUNDS, seed=seed, population_size=4)
+    assert alone[0] == np.array([cma.ask() for _ in range(4)]).tobytes()
 
 
 def test_nsga2_spreads_over_the_front():
@@ -173,6 +215,8 @@ class Scored:
 
 
 SETTINGS = StudySettings(controller("smc/base"), seed=5)
+# Four runs take turns until trial 289, two of them until trial 433.
+RACE = StudySettings(controller("smc/base"), seed=5, population=4)
 
 
 @pytest.fixture
@@ -199,30 +243,53 @@ def outline(study):
     ]
 
 
-@pytest.mark.parametrize("searcher", ["cma-es", "nelder-mead", "pattern"])
-def test_trials_do_not_depend_on_the_number_of_workers(scored, tmp_path, searcher):
-    settings = StudySettings(controller("smc/base"), searcher, seed=5)
-    reason, one = run(tmp_path / "1.sqlite", settings=settings)
+@pytest.mark.parametrize(
+    ("searcher", "trials"), [("cma-es", 450), ("nelder-mead", 40), ("pattern", 40)]
+)
+def test_trials_do_not_depend_on_the_number_of_workers(scored, tmp_path, searcher, trials):
+    settings = replace(RACE, searcher=searcher)
+    reason, one = run(tmp_path / "1.sqlite", trials, settings=settings)
     scored.seconds = 1e-3
-    _, four = run(tmp_path / "4.sqlite", workers=4, settings=settings)
+    _, four = run(tmp_path / "4.sqlite", trials, workers=4, settings=settings)
     assert reason == "trials"
-    assert sum(t[3] is not None for t in one) == 40
+    assert sum(t[3] is not None for t in one) == trials
     assert one == four
-    assert len(scored.calls) == 80
+    assert len(scored.calls) == 2 * trials
 
 
 def test_a_study_that_was_stopped_goes_on_as_if_it_had_not_been(scored, tmp_path):
-    _, undisturbed = run(tmp_path / "whole.sqlite")
+    _, undisturbed = run(tmp_path / "whole.sqlite", 460, settings=RACE)
     scored.calls.clear()
-    for most in (1, 7, 20):
+    for most in (1, 8, 320, 440):  # at the start, and with four runs, two and one left
         scored.at_most = most
-        run(tmp_path / "parts.sqlite", workers=2)
+        run(tmp_path / "parts.sqlite", 460, settings=RACE)
     scored.at_most = None
-    _, parts = run(tmp_path / "parts.sqlite", workers=2)
+    _, parts = run(tmp_path / "parts.sqlite", 460, workers=2, settings=RACE)
     assert parts == undisturbed
-    assert len(scored.calls) == 40  # none was scored twice
+    assert len(scored.calls) == 460  # none was scored twice
     # More trials of the same study: those of a longer one from the start.
-    assert run(tmp_path / "parts.sqlite", 60)[1] == run(tmp_path / "long.sqlite", 60)[1]
+    parts = run(tmp_path / "parts.sqlite", 480, settings=RACE)[1]
+    assert parts == run(tmp_path / "long.sqlite", 480, settings=RACE)[1]
+
+
+def test_runs_are_told_from_the_store_and_the_best_is_that_of_all(scored, tmp_path):
+    run(tmp_path / "s.sqlite", 450, settings=RACE)
+    store = Store(tmp_path / "s.sqlite")
+    study = Study(store, "test")
+    trials = [t for t in study.trials() if t.found is not None]
+    runs = [study.run_of(t.generation) for t in trials]
+    assert runs[:17] == [1] + [1] * 4 + [2] * 4 + [3] * 4 + [4] * 4
+    assert runs[1:289] == runs[1:17] * 18
+    assert len({*runs[289:433]}) == 2
+    assert len({*runs[433:]}) == 1
+    confirmed = [t for t in trials if t.found.confirmed]
+    assert best_trial(trials).found.score == max(t.found.score for t in confirmed)
+    rows = run_rows(study, trials)
+    assert [row["trials"] for row in rows] == [runs.count(k) for k in (1, 2, 3, 4)]
+    for row in rows:
+        of_run = [t.found.score for t, k in zip(trials, runs, strict=True) if k == row["run"]]
+        assert row["score"] == max(of_run)
+    store.close()
 
 
 def test_two_owners_share_a_study_and_score_nothing_twice(scored, tmp_path):
@@ -392,8 +459,10 @@ def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
     assert again.as_json() == settings.as_json()
     assert again.model == settings.model
     assert again.stages == settings.stages
-    # Studies that were begun before there were candidates go on.
-    assert "candidates" not in again.as_json()
+    # Studies that were begun before there were candidates, or several runs, go on.
+    assert not {"candidates", "runs"} & set(again.as_json())
+    assert StudySettings.from_json(replace(RACE, runs=1).as_json()).run_count == 1
+    assert StudySettings.from_json(RACE.as_json()).run_count == RACE.run_count == 4
     given = replace(settings, searcher="given", candidates=((0.1,) * 20, (1.0 / 3.0,) * 20))
     again = StudySettings.from_json(json.loads(json.dumps(given.as_json())))
     assert (again.candidates, again.as_json()) == (given.candidates, given.as_json())
@@ -421,6 +490,9 @@ def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
         ("slope_step_deg", {"stages": (Stage(0.3, 0.1),)}),
         ("step", {"step": 0.0}),
         ("population", {"population": 1}),
+        ("runs", {"runs": -1}),
+        ("runs", {"runs": 1001}),
+        ("runs", {"runs": 2, "searcher": "pattern"}),
         ("margin", {"stages": (Stage(0.5, 0.3, math.nan),)}),
         ("check_sigmas", {"check_sigmas": (1.0, math.nan)}),
         ("check_steps", {"check_steps": math.nan}),

@@ -16,7 +16,7 @@ from biped_mfpt_ros.optimise.study import Study
 
 # A coarse mesh without a check: some milliseconds for a trial.
 QUICK = ("--controller", "hzd/mfpt", "--mesh", "1:1", "--check-walks", "0", "--seed", "2",
-         "--step", "0.5", "--local", "--quiet")  # fmt: skip
+         "--step", "0.5", "--population", "4", "--local", "--quiet")  # fmt: skip
 
 
 def outline(path, name="s"):
@@ -56,9 +56,12 @@ def test_result_is_told(finished, capsys):
     best = max(t[3] for t in outline(finished))
     assert result["best"]["score"] == best
     assert result["best"]["stage"] == "confirmed"
+    assert [row["trials"] for row in result["runs"]] == [8, 4, 4, 4]
+    assert max(row["score"] for row in result["runs"]) == best
     assert optimise(finished, "--trials", "20") == 0
     text = capsys.readouterr().out
     assert "study s: 20 trials" in text
+    assert f"run 1: 8 trials, best score {result['runs'][0]['score']:.3g}" in text
     assert "outside of the step map" in text
 
 
@@ -155,6 +158,8 @@ def test_the_papers_controllers_are_where_the_paper_has_them(finished):
         (["--limit", "weight_max=3"], "limits: 'weight_max'"),
         (["--fix", "omega"], "omega"),
         (["--sigma", "0"], "--sigma: 0.0"),
+        (["--runs", "-1"], "runs: -1 is not allowed; allowed: 0 to"),
+        (["--runs", "2", "--searcher", "pattern"], "runs: 2 is not allowed"),
         (["--mesh", "1"], "'1' is not allowed"),
         (["--mesh", "0.3:1"], "0.3"),
         (["--trials", "0"], "--trials: 0"),

@@ -16,7 +16,6 @@ from ros_graph import STARTING, result_of, ros_graph, wait_for
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.nodes.analysis import Analysis
 from biped_mfpt_ros.nodes.mesher import Mesher
-from biped_mfpt_ros.nodes.messages import controller_message
 from biped_mfpt_ros.nodes.optimiser import (
     MOST_REFUSED,
     Optimiser,
@@ -203,6 +202,7 @@ def test_a_flood_of_goals_and_cancels_leaves_a_study_alone(client, store_path, t
     [
         ({"study": ""}, "study: '' is not allowed"),
         ({"searcher": "luck"}, "searcher: 'luck' is not allowed; allowed: cma-es"),
+        ({"runs": 1001}, "runs: 1001 is not allowed; allowed: 0 to 1000"),
         ({"sigma_s": math.nan}, "sigma_s: nan is not allowed"),
         ({"objectives": ["mfpt", "cot"], "weights": [1.0]}, "weights: '1 numbers'"),
         ({"thresholds": [1.0]}, "as many of each"),
@@ -228,13 +228,10 @@ def test_settings_survive_the_message():
         stages=(Stage(0.1, 0.3), Stage(0.25, 0.03, -0.02)),
     )  # fmt: skip
     assert settings_from(goal_message("x", settings)).as_json() == settings.as_json()
+    several = replace(settings, searcher="cma-es", runs=7)
+    assert settings_from(goal_message("x", several)).as_json() == several.as_json()
     given = replace(settings, searcher="given", candidates=((0.1,) * 20, (1.0 / 3.0,) * 20))
     assert settings_from(goal_message("x", given)).as_json() == given.as_json()
-
-
-def test_a_goal_that_says_little_has_the_settings_of_the_library():
-    goal = Optimise.Goal(study="x", start=controller_message(controller("hzd/mfpt")))
-    assert settings_from(goal).as_json() == StudySettings(controller("hzd/mfpt")).as_json()
 
 
 def test_given_candidates_are_tried_once_each(client, store_path, tmp_path):

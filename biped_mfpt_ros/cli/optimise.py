@@ -16,7 +16,7 @@ from biped_mfpt_ros.cli import options
 from biped_mfpt_ros.cli.kernels import compile_all, work
 from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
-from biped_mfpt_ros.cli.study import summary_text, trial_row
+from biped_mfpt_ros.cli.study import add_to_run, run_rows, score_text, summary_text, trial_row
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.local import LocalBackend
 from biped_mfpt_ros.optimise.settings import DEFAULT_STAGES, Stage, StudySettings
@@ -68,6 +68,7 @@ def optimise(args: argparse.Namespace) -> None:
         "settings": settings.as_json(),
         "ended": ended,
         "trials": sum(t.found is not None for t in trials),
+        "runs": run_rows(study, trials),
         **tally.throughput(),
     }
     best = best_trial(trials)
@@ -89,7 +90,10 @@ def _locally(study: Study, workers: int, args: argparse.Namespace, tally: _Tally
     def on_trial(trial: Trial) -> None:
         assert trial.found is not None
         found = trial.found
-        tally.add(trial.number, found.score, found.confirmed, found.values, found.step_map_seconds)
+        tally.add(
+            trial.number, trial.generation, found.score, found.confirmed, found.values,
+            found.step_map_seconds,
+        )  # fmt: skip
 
     return study.run(LocalBackend(), workers, args.trials, args.seconds, on_trial)
 
@@ -101,7 +105,10 @@ def _over_ros(
 
     def on_trial(trial: Any) -> None:
         values = dict(zip(trial.measures, trial.measured, strict=True))
-        tally.add(trial.trial, trial.score, trial.confirmed, values, trial.step_map_seconds)
+        tally.add(
+            trial.trial, trial.generation, trial.score, trial.confirmed, values,
+            trial.step_map_seconds,
+        )  # fmt: skip
 
     return run_study(
         study.name, study.settings, Path(args.store), workers, args.trials, args.seconds,
@@ -137,6 +144,7 @@ def _settings(args: argparse.Namespace) -> StudySettings:
         searcher=args.searcher,
         step=args.step,
         population=args.population,
+        runs=args.runs,
         fixed=tuple(args.fix),
         objectives=dict(args.objective),
         limits=dict(args.limit),
@@ -167,6 +175,7 @@ class _Tally:
         seconds: float | None,
     ) -> None:
         self.before = [t for t in study.trials() if t.found is not None]
+        self._study, self._runs = study, run_rows(study, self.before)
         self.done = 0
         self._progress, self._workers = progress, workers
         self._limit, self._most_seconds = limit, seconds
@@ -189,6 +198,7 @@ class _Tally:
     def add(
         self,
         number: int,
+        generation: int,
         score: float,
         confirmed: bool,
         values: Mapping[str, float],
@@ -197,14 +207,22 @@ class _Tally:
         """Take a trial in and show the line."""
         self.done += 1
         self._step_map_seconds += step_map_seconds
+        of_run = ""
+        if self._runs:
+            run = self._study.run_of(generation)
+            add_to_run(self._runs[run - 1], score)
+            of_run = f" of run {run}"
         if confirmed and score > self._best_score:
             self._best_score, self._best_text = score, _found_text(values)
-            self._progress.say(f"trial {number}: {self._best_text}")
+            self._progress.say(f"trial {number}{of_run}: {self._best_text}")
         throughput = self.throughput()
         rate = throughput["trials_per_second"]
         total = len(self.before) + self.done
         parts = [f"{total} trials" if self._limit is None else f"{total} of {self._limit} trials"]
         parts.append(f"best {self._best_text}")
+        if self._runs:
+            scores = ", ".join(score_text(row) for row in self._runs)
+            parts.append(f"run {run} of best scores {scores}")
         parts.append(f"{rate_text(rate)} trials/s")
         parts.append(f"{100.0 * throughput['outside_step_map']:.0f} % outside the step map")
         left = []

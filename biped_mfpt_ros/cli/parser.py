@@ -361,6 +361,14 @@ examples:
         help="candidates in a generation (default: the searcher's own)",
     )
     optimise.add_argument(
+        "--runs",
+        type=_whole,
+        default=0,
+        metavar="N",
+        help="runs of cma-es from the same start, each with random numbers of its own; they take "
+        "turns, and the worse half ends again and again (default: 4)",
+    )
+    optimise.add_argument(
         "--trials", type=_whole, metavar="N", help="stop when the study has N trials"
     )
     optimise.add_argument(
@@ -427,7 +435,27 @@ examples:
     )
 
 
-def _add_run(add: Callable[..., Parser]) -> None:
+def make_parser() -> Parser:
+    """The parser of `biped-mfpt` with all its subcommands."""
+    parser = Parser(prog="biped-mfpt", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("--version", action="version", version=f"biped-mfpt {__version__}")
+    commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", dest="command", required=True, parser_class=Parser
+    )
+    parents = _parents()
+
+    def add(name: str, function: str, summary: str, details: str, *groups: str) -> Parser:
+        description, _, examples = details.strip().partition("\nexamples:\n")
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary[0].upper()}{summary[1:]}.\n\n{description}",
+            epilog=f"examples:\n{examples}" if examples else None,
+            parents=[parents[group] for group in groups],
+        )
+        command.set_defaults(function=f"{CLI}.{function}", parser=command)
+        return command
+
     run = add(
         "run",
         "pipeline:run",
@@ -493,8 +521,6 @@ examples:
         help="new directory for bag, picture and logs (default: runs/TIME-CONTROLLER)",
     )
 
-
-def _add_mfpt(add: Callable[..., Parser]) -> None:
     mfpt = add(
         "mfpt",
         "meshes:mfpt",
@@ -521,8 +547,6 @@ examples:
         help="degrees, standard deviations of the slope",
     )
 
-
-def _add_mesh(add: Callable[..., Parser]) -> None:
     mesh = add(
         "mesh",
         "meshes:mesh",
@@ -541,8 +565,6 @@ examples:
     )
     mesh.add_argument("--output", metavar="FILE", help="write the mesh to this new .npz file")
 
-
-def _add_monte_carlo(add: Callable[..., Parser]) -> None:
     monte_carlo = add(
         "monte-carlo",
         "single:monte_carlo",
@@ -581,8 +603,6 @@ examples:
         help="stop a walk that has not fallen after N steps (default: %(default)s)",
     )
 
-
-def _add_cycle(add: Callable[..., Parser]) -> None:
     cycle = add(
         "cycle",
         "single:cycle",
@@ -605,8 +625,6 @@ examples:
         help="degrees, constant slope, negative is downhill (default: 0)",
     )
 
-
-def _add_step(add: Callable[..., Parser]) -> None:
     step = add(
         "step",
         "single:step",
@@ -645,8 +663,6 @@ examples:
         help="degrees, ground ahead, negative is downhill (default: 0)",
     )
 
-
-def _add_reproduce(add: Callable[..., Parser]) -> None:
     reproduce = add(
         "reproduce",
         "reproduce:reproduce",
@@ -702,8 +718,6 @@ examples:
         help="leave out the pictures of gaits and meshes",
     )
 
-
-def _add_calibrate(add: Callable[..., Parser]) -> None:
     calibrate = add(
         "calibrate",
         "calibrate:calibrate",
@@ -775,8 +789,9 @@ examples:
         "(default: %(default)s)",
     )
 
+    _add_optimise(add)
+    _add_study(add)
 
-def _add_picture(add: Callable[..., Parser]) -> None:
     picture = add(
         "picture",
         "picture:picture",
@@ -824,8 +839,6 @@ examples:
         help="how much of the walk to draw (default: %(default)s)",
     )
 
-
-def _add_inspect(add: Callable[..., Parser]) -> None:
     inspect = add(
         "inspect",
         "bags:inspect",
@@ -863,8 +876,6 @@ examples:
         "whole bag, and read that; BAG stays as it is",
     )
 
-
-def _add_controllers(add: Callable[..., Parser]) -> None:
     controllers = add(
         "controllers",
         "single:controllers",
@@ -879,42 +890,6 @@ examples:
         "output",
     )
     controllers.add_argument("name", nargs="?", metavar="NAME", help="print this one as JSON")
-
-
-def make_parser() -> Parser:
-    """The parser of `biped-mfpt` with all its subcommands."""
-    parser = Parser(prog="biped-mfpt", description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("--version", action="version", version=f"biped-mfpt {__version__}")
-    commands = parser.add_subparsers(
-        title="commands", metavar="COMMAND", dest="command", required=True, parser_class=Parser
-    )
-    parents = _parents()
-
-    def add(name: str, function: str, summary: str, details: str, *groups: str) -> Parser:
-        description, _, examples = details.strip().partition("\nexamples:\n")
-        command = commands.add_parser(
-            name,
-            help=summary,
-            description=f"{summary[0].upper()}{summary[1:]}.\n\n{description}",
-            epilog=f"examples:\n{examples}" if examples else None,
-            parents=[parents[group] for group in groups],
-        )
-        command.set_defaults(function=f"{CLI}.{function}", parser=command)
-        return command
-
-    _add_run(add)
-    _add_mfpt(add)
-    _add_mesh(add)
-    _add_monte_carlo(add)
-    _add_cycle(add)
-    _add_step(add)
-    _add_reproduce(add)
-    _add_calibrate(add)
-    _add_optimise(add)
-    _add_study(add)
-    _add_picture(add)
-    _add_inspect(add)
-    _add_controllers(add)
 
     node = commands.add_parser(
         "node",

@@ -169,6 +169,8 @@ def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
         stages[t.found.stage] = stages.get(t.found.stage, 0) + 1
     counts = ", ".join(f"{count} {stage}" for stage, count in sorted(stages.items()))
     lines = [f"study {study.name}: {len(done)} trials ({counts})"]
+    for row in run_rows(study, trials):
+        lines.append(f"run {row['run']}: {row['trials']} trials, best score {score_text(row)}")
     confirmed = sorted(
         (t for t in done if t.found is not None and t.found.confirmed),
         key=lambda t: (-t.found.score, t.number),  # type: ignore[union-attr]
@@ -190,6 +192,34 @@ def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
                      check))  # fmt: skip
     headers = ("trial", "score", f"MFPT at {sigma:g} deg", "states", "COT", "m/s", "Monte Carlo")
     return "\n".join([*lines, "", "confirmed:", table(headers, rows)])
+
+
+def run_rows(study: Study, trials: list[Trial]) -> list[dict[str, Any]]:
+    """How many trials each run of a search had, and their best score; empty if there is but one.
+
+    A run that is behind gets no fine mesh, so that its score need not be a confirmed one.
+    """
+    count = study.settings.run_count
+    if count == 1:
+        return []
+    rows: list[dict[str, Any]] = [
+        {"run": number, "trials": 0, "score": None} for number in range(1, count + 1)
+    ]
+    for t in trials:
+        if t.found is not None:
+            add_to_run(rows[study.run_of(t.generation) - 1], t.found.score)
+    return rows
+
+
+def add_to_run(row: dict[str, Any], score: float) -> None:
+    """Count a trial in the row of its run."""
+    row["trials"] += 1
+    row["score"] = score if row["score"] is None else max(score, row["score"])
+
+
+def score_text(row: dict[str, Any]) -> str:
+    """Best score of a run, for readers."""
+    return "-" if row["score"] is None else f"{row['score']:.3g}"
 
 
 def _export(opened: Study, args: argparse.Namespace) -> None:

@@ -54,6 +54,8 @@ class Searcher(ABC):
         First step, in scaled coordinates.
     population : int
         Candidates in a generation, if the method has a choice; 0: its default.
+    runs : int
+        How many runs `CmaEs` begins with.
     objectives : int
         How many costs are told.
     candidates : sequence of sequence of float
@@ -62,6 +64,8 @@ class Searcher(ABC):
 
     done = False
     """Whether the search has converged: there is nothing more to ask."""
+    run = 1
+    """Of which run the next generation is, from 1."""
 
     def __init__(
         self,
@@ -69,12 +73,13 @@ class Searcher(ABC):
         seed: int = 0,
         step: float = 1.0,
         population: int = 0,
+        runs: int = 1,
         objectives: int = 1,
         candidates: Sequence[Sequence[float]] = (),
     ) -> None:
         self.bounds = np.asarray(bounds, dtype=np.float64)
         self.n = len(self.bounds)
-        self.seed, self.step, self.population = seed, step, population
+        self.seed, self.step, self.population, self.runs = seed, step, population, runs
         self.objectives = objectives
         self.candidates = candidates
         self._started = False
@@ -115,34 +120,65 @@ class Searcher(ABC):
 
 
 class CmaEs(Searcher):
-    """CMA-ES (Hansen), of the package `cmaes`; restarted from the best when it has converged."""
+    """CMA-ES (Hansen), of the package `cmaes`: runs from the same start, of which the best go on.
+
+    The runs take turns, a generation each. After `HEAT` generations of each the worse half of them
+    ends, until one is left, which goes on without end: where a run leads is a matter of luck, and
+    what it is worth shows long before it has got there. A run that has converged is restarted from
+    its best with twice the population.
+    """
+
+    HEAT = 18
 
     def _begin(self, start: Told) -> None:
-        self._best, self._best_score = np.zeros(self.n), start.score
+        self._left = [_CmaRun(self, 1 + i, start.score) for i in range(self.runs)]
+        self._turn = 0  # generations of this heat
+
+    def _ask(self) -> np.ndarray:
+        return self._left[self._turn % len(self._left)].ask()
+
+    def _tell(self, vectors: np.ndarray, told: list[Told]) -> None:
+        self._left[self._turn % len(self._left)].tell(vectors, told)
+        self._turn += 1
+        if self._turn == self.HEAT * len(self._left):
+            self._turn = 0
+            best = sorted(self._left, key=lambda run: -run.best_score)
+            best = best[: (len(best) + 1) // 2]
+            self._left = [run for run in self._left if run in best]
+        self.run = self._left[self._turn % len(self._left)].number
+
+
+class _CmaRun:
+    """One run of `CmaEs`."""
+
+    def __init__(self, of: CmaEs, number: int, start_score: float) -> None:
+        self._of, self.number = of, number
+        self._best, self.best_score = np.zeros(of.n), start_score
         self._restarts = 0
         self._restart()
 
     def _restart(self) -> None:
         from cmaes import CMA
 
-        size = self.population or 2 * ((4 + int(3 * np.log(self.n)) + 1) // 2)
+        of = self._of
+        size = of.population or 2 * ((4 + int(3 * np.log(of.n)) + 1) // 2)
+        words = [of.seed, self._restarts, self.number - 1]
         self._cma = CMA(
             mean=self._best.copy(),
-            sigma=self.step,
-            bounds=self.bounds,
-            # One more number for each restart; the population doubles (IPOP).
-            seed=int(np.random.SeedSequence([self.seed, self._restarts]).generate_state(1)[0]),
-            population_size=size * 2**self._restarts,
+            sigma=of.step,
+            bounds=of.bounds,
+            seed=int(np.random.SeedSequence(words).generate_state(1)[0]),
+            population_size=size * 2**self._restarts,  # IPOP
         )
 
-    def _ask(self) -> np.ndarray:
+    def ask(self) -> np.ndarray:
         return np.array([self._cma.ask() for _ in range(self._cma.population_size)])
 
-    def _tell(self, vectors: np.ndarray, told: list[Told]) -> None:
+    def tell(self, vectors: np.ndarray, told: list[Told]) -> None:
         self._cma.tell([(x, -one.score) for x, one in zip(vectors, told, strict=True)])
         best = max(range(len(told)), key=lambda i: told[i].score)
-        if told[best].score > self._best_score:
-            self._best, self._best_score = vectors[best].copy(), told[best].score
+        if told[best].score > self.best_score:
+            self._best, self.best_score = vectors[best].copy(), told[best].score
         if self._cma.should_stop():
             self._restarts += 1
             self._restart()

@@ -65,6 +65,9 @@ DEFAULT_STAGES = (
 """Screen coarse, check finer, confirm as the issue asks."""
 
 
+_RUNS, _MOST_RUNS = 4, 1000
+
+
 @dataclass(frozen=True)
 class StudySettings:
     """Settings of a study. All angles in rad but the few that end in _deg.
@@ -81,6 +84,8 @@ class StudySettings:
         First step of the search, as a multiple of the scales of the space.
     population : int
         Candidates in a generation; 0: the searcher's own.
+    runs : int
+        How many the search begins with, for ``cma-es`` alone; 0: its own choice.
     fixed : tuple of str
         Patterns of coordinates that are not searched.
     candidates : tuple of tuple of float
@@ -120,6 +125,7 @@ class StudySettings:
     seed: int = 1
     step: float = 1.0
     population: int = 0
+    runs: int = 0
     fixed: tuple[str, ...] = ()
     candidates: tuple[tuple[float, ...], ...] = ()
     objectives: dict[str, float] = field(default_factory=lambda: {"mfpt": 1.0})
@@ -142,6 +148,9 @@ class StudySettings:
         # CMA-ES learns from the difference between two at least.
         most, size = 100_000, self.population
         _check("population", size, size == 0 or 2 <= size <= most, f"0, or 2 to {most}")
+        most = _MOST_RUNS if self.searcher == "cma-es" else 1
+        allowed = f"0 to {_MOST_RUNS} for cma-es, 0 or 1 for other searchers"
+        _check("runs", self.runs, 0 <= self.runs <= most, allowed)
         _check("objectives", list(self.objectives), bool(self.objectives), "at least one")
         for name, weight in self.objectives.items():
             _check("objectives", name, name in OBJECTIVES, ", ".join(OBJECTIVES))
@@ -174,6 +183,11 @@ class StudySettings:
         """Slope set of each stage, rad."""
         return tuple(slope_set(s.slope_step_deg, self.slope_limit_deg) for s in self.stages)
 
+    @property
+    def run_count(self) -> int:
+        """How many runs the search begins with."""
+        return self.runs or (_RUNS if self.searcher == "cma-es" else 1)
+
     def as_json(self) -> dict[str, Any]:
         """All of it, of JSON's types; infinities are strings that ``float`` reads."""
         start = {"name": self.start.name, "scheme": self.start.scheme}
@@ -181,15 +195,20 @@ class StudySettings:
         out["start"] = start | {"parameters": self.start.parameters.tolist()}
         out["model"] = {name: _text(value) for name, value in model_values(self.model).items()}
         out["stages"] = [{k: _text(v) for k, v in asdict(s).items()} for s in self.stages]
-        if not self.candidates:  # a study that was begun before there were any goes on
+        # A study that was begun before there were candidates, or several runs, goes on.
+        if not self.candidates:
             del out["candidates"]
+        if (count := self.run_count) > 1:
+            out["runs"] = count
+        else:
+            del out["runs"]
         return {k: list(v) if isinstance(v, tuple) else v for k, v in out.items()}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> StudySettings:
         """Settings as `as_json` gave them."""
         start = data["start"]
-        given = dict(data)
+        given = {"runs": 1} | data
         given["start"] = Controller(start["name"], start["scheme"], np.array(start["parameters"]))
         model = {k: math.inf if v == "inf" else v for k, v in data["model"].items()}
         given["model"] = model_from(model)

@@ -80,6 +80,7 @@ class Study:
             seed=self.settings.seed,
             step=self.settings.step,
             population=self.settings.population,
+            runs=self.settings.run_count,
             objectives=len(self.settings.objectives),
             candidates=self.settings.candidates,
         )
@@ -87,6 +88,7 @@ class Study:
         self._id = store.open(name)[0] if settings is None else store.create(name, settings)
         self._lock = threading.Condition()
         self._told = 0  # generations
+        self._runs = [1]  # of which run each of these is, and the one that is open
         self._first = 0  # number of the first trial of the generation that is open
         self._best = Best()
 
@@ -98,6 +100,13 @@ class Study:
     def trials(self) -> list[Trial]:
         """All trials by now, in order."""
         return self.store.trials(self._id)
+
+    def run_of(self, generation: int) -> int:
+        """Of which run of the search a generation is, from 1; the start is of the first."""
+        with self._lock:
+            if generation >= len(self._runs):
+                self._catch_up()
+            return self._runs[generation]
 
     def run(
         self,
@@ -242,6 +251,7 @@ class Study:
             self._searcher.tell(vectors, [Told(e.score, e.costs, e.violation) for e in found])
             self._best = improved(self._best, found)
             self._told += 1
+            self._runs.append(self._searcher.run)
             self._first += len(generation)
             self._lock.notify_all()
 
@@ -303,7 +313,7 @@ def confirming(study: Study, **changed: Any) -> StudySettings:
         raise InputError("study", study.name, "one with a trial that a mesh has confirmed")
     ordered = sorted(found)
     candidates = tuple(found[ordered[i]] for i in front_of(ordered))
-    return replace(study.settings, searcher="given", candidates=candidates, **changed)
+    return replace(study.settings, searcher="given", runs=0, candidates=candidates, **changed)
 
 
 def improved(best: Best, found: list[Evaluation]) -> Best:
