@@ -96,13 +96,14 @@ def test_another_robot_goes_through_a_message():
 
 def test_messages_have_the_defaults_of_the_library():
     assert messages.model_from(sent(WalkerModelMsg())) == WalkerModel()
-    wanted = MeshSettings(controller("hzd/base"), WalkerModel(), slope_set(5.0), 0.03)
-    sparse = MeshSettingsMsg(controller=ControllerMsg(name="hzd/base"), slopes=wanted.slopes)
-    got = messages.settings_from(sent(sparse))
-    for name in ("model", "clustered", "scale_refresh", "max_states", "initial_slope"):
-        assert getattr(got, name) == getattr(wanted, name), name
     parser = make_parser().parse_args(["run"])
-    assert got.threshold == parser.threshold
+    slopes = slope_set(parser.slope_step, parser.slope_limit)
+    wanted = MeshSettings(controller("hzd/base"), WalkerModel(), slopes, parser.threshold)
+    sparse = MeshSettingsMsg(controller=ControllerMsg(name="hzd/base"))
+    got = messages.settings_from(sent(sparse))
+    assert same_bits(got.slopes, wanted.slopes)
+    for name in ("model", "threshold", "clustered", "scale_refresh", "max_states", "initial_slope"):
+        assert getattr(got, name) == getattr(wanted, name), name
 
 
 def settings(**changes):
@@ -159,7 +160,7 @@ def edit(message, path, value):
         ("model.time_limit", math.inf, "model.time_limit"),
         ("model.friction_frame", "horizontal", "model.friction_frame"),
         ("model.robot.gravity", 0.0, "model.robot.gravity"),
-        ("slopes", [], "slopes"),
+        ("slopes", [math.inf], "slopes[0]"),
         ("slopes", [0.1, 0.0], "slopes[1]"),
         ("slopes", [0.0, math.nan], "slopes[1]"),
         ("slopes", [0.0, 1.0], "slopes[1]"),

@@ -308,7 +308,6 @@ class TestBadGoals:
             (changed(threshold=math.nan), ("settings.threshold", "nan")),
             (changed(slopes=[0.1, 0.0]), ("settings.slopes[1]", "ascending")),
             (changed(slopes=[0.0, 2.0]), ("settings.slopes[1]", "45 degrees")),
-            (changed(slopes=[]), ("settings.slopes", "at least one")),
             (
                 changed(initial_state=[0.0] * 3),
                 ("settings.initial_state", "length 3", "10 numbers"),

@@ -16,6 +16,7 @@ from ros_graph import STARTING, result_of, ros_graph, wait_for
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.nodes.analysis import Analysis
 from biped_mfpt_ros.nodes.mesher import Mesher
+from biped_mfpt_ros.nodes.messages import controller_message
 from biped_mfpt_ros.nodes.optimiser import (
     MOST_REFUSED,
     Optimiser,
@@ -232,6 +233,11 @@ def test_settings_survive_the_message():
     assert settings_from(goal_message("x", several)).as_json() == several.as_json()
     given = replace(settings, searcher="given", candidates=((0.1,) * 20, (1.0 / 3.0,) * 20))
     assert settings_from(goal_message("x", given)).as_json() == given.as_json()
+
+
+def test_a_goal_that_says_little_has_the_settings_of_the_library():
+    goal = Optimise.Goal(study="x", start=controller_message(controller("hzd/mfpt")))
+    assert settings_from(goal).as_json() == StudySettings(controller("hzd/mfpt")).as_json()
 
 
 def test_given_candidates_are_tried_once_each(client, store_path, tmp_path):

@@ -72,6 +72,14 @@ class TestProgress:
             progress.show("two")
         assert stream.getvalue() == "\rone\x1b[K\rtwo\x1b[K\r\x1b[K"
 
+    def test_a_log_has_no_line_twice_in_a_row(self, clock):
+        stream = io.StringIO()
+        with Progress(stream=stream) as progress:
+            for text in ("one", "one", "two", "one"):
+                clock.now += 60.0
+                progress.show(text)
+        assert stream.getvalue() == "one\ntwo\none\n"
+
     def test_a_long_line_does_not_wrap(self, clock):
         stream = Terminal()
         Progress(stream=stream).show("x" * 500)

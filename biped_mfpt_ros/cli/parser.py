@@ -435,27 +435,7 @@ examples:
     )
 
 
-def make_parser() -> Parser:
-    """The parser of `biped-mfpt` with all its subcommands."""
-    parser = Parser(prog="biped-mfpt", description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("--version", action="version", version=f"biped-mfpt {__version__}")
-    commands = parser.add_subparsers(
-        title="commands", metavar="COMMAND", dest="command", required=True, parser_class=Parser
-    )
-    parents = _parents()
-
-    def add(name: str, function: str, summary: str, details: str, *groups: str) -> Parser:
-        description, _, examples = details.strip().partition("\nexamples:\n")
-        command = commands.add_parser(
-            name,
-            help=summary,
-            description=f"{summary[0].upper()}{summary[1:]}.\n\n{description}",
-            epilog=f"examples:\n{examples}" if examples else None,
-            parents=[parents[group] for group in groups],
-        )
-        command.set_defaults(function=f"{CLI}.{function}", parser=command)
-        return command
-
+def _add_run(add: Callable[..., Parser]) -> None:
     run = add(
         "run",
         "pipeline:run",
@@ -521,6 +501,8 @@ examples:
         help="new directory for bag, picture and logs (default: runs/TIME-CONTROLLER)",
     )
 
+
+def _add_mfpt(add: Callable[..., Parser]) -> None:
     mfpt = add(
         "mfpt",
         "meshes:mfpt",
@@ -547,6 +529,8 @@ examples:
         help="degrees, standard deviations of the slope",
     )
 
+
+def _add_mesh(add: Callable[..., Parser]) -> None:
     mesh = add(
         "mesh",
         "meshes:mesh",
@@ -565,6 +549,8 @@ examples:
     )
     mesh.add_argument("--output", metavar="FILE", help="write the mesh to this new .npz file")
 
+
+def _add_monte_carlo(add: Callable[..., Parser]) -> None:
     monte_carlo = add(
         "monte-carlo",
         "single:monte_carlo",
@@ -603,6 +589,8 @@ examples:
         help="stop a walk that has not fallen after N steps (default: %(default)s)",
     )
 
+
+def _add_cycle(add: Callable[..., Parser]) -> None:
     cycle = add(
         "cycle",
         "single:cycle",
@@ -625,6 +613,8 @@ examples:
         help="degrees, constant slope, negative is downhill (default: 0)",
     )
 
+
+def _add_step(add: Callable[..., Parser]) -> None:
     step = add(
         "step",
         "single:step",
@@ -663,6 +653,8 @@ examples:
         help="degrees, ground ahead, negative is downhill (default: 0)",
     )
 
+
+def _add_reproduce(add: Callable[..., Parser]) -> None:
     reproduce = add(
         "reproduce",
         "reproduce:reproduce",
@@ -718,6 +710,8 @@ examples:
         help="leave out the pictures of gaits and meshes",
     )
 
+
+def _add_calibrate(add: Callable[..., Parser]) -> None:
     calibrate = add(
         "calibrate",
         "calibrate:calibrate",
@@ -789,9 +783,8 @@ examples:
         "(default: %(default)s)",
     )
 
-    _add_optimise(add)
-    _add_study(add)
 
+def _add_picture(add: Callable[..., Parser]) -> None:
     picture = add(
         "picture",
         "picture:picture",
@@ -839,6 +832,8 @@ examples:
         help="how much of the walk to draw (default: %(default)s)",
     )
 
+
+def _add_inspect(add: Callable[..., Parser]) -> None:
     inspect = add(
         "inspect",
         "bags:inspect",
@@ -876,6 +871,8 @@ examples:
         "whole bag, and read that; BAG stays as it is",
     )
 
+
+def _add_controllers(add: Callable[..., Parser]) -> None:
     controllers = add(
         "controllers",
         "single:controllers",
@@ -890,6 +887,42 @@ examples:
         "output",
     )
     controllers.add_argument("name", nargs="?", metavar="NAME", help="print this one as JSON")
+
+
+def make_parser() -> Parser:
+    """The parser of `biped-mfpt` with all its subcommands."""
+    parser = Parser(prog="biped-mfpt", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("--version", action="version", version=f"biped-mfpt {__version__}")
+    commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", dest="command", required=True, parser_class=Parser
+    )
+    parents = _parents()
+
+    def add(name: str, function: str, summary: str, details: str, *groups: str) -> Parser:
+        description, _, examples = details.strip().partition("\nexamples:\n")
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary[0].upper()}{summary[1:]}.\n\n{description}",
+            epilog=f"examples:\n{examples}" if examples else None,
+            parents=[parents[group] for group in groups],
+        )
+        command.set_defaults(function=f"{CLI}.{function}", parser=command)
+        return command
+
+    _add_run(add)
+    _add_mfpt(add)
+    _add_mesh(add)
+    _add_monte_carlo(add)
+    _add_cycle(add)
+    _add_step(add)
+    _add_reproduce(add)
+    _add_calibrate(add)
+    _add_optimise(add)
+    _add_study(add)
+    _add_picture(add)
+    _add_inspect(add)
+    _add_controllers(add)
 
     node = commands.add_parser(
         "node",

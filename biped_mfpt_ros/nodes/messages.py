@@ -27,10 +27,13 @@ from biped_mfpt_ros.gait.step import Steps, check_states
 from biped_mfpt_ros.models import ROBOT_FIELDS, robot_from
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, Robot, WalkerModel, rabbit
-from biped_mfpt_ros.walker.terrain import check_slopes
+from biped_mfpt_ros.walker.terrain import check_slopes, slope_set
 
 if TYPE_CHECKING:  # a simulator needs no chain, and importing it takes a fifth of its start
     from biped_mfpt_ros.chain.markov import Metastability
+
+DEFAULT_SLOPE_STEP_DEG = 0.25
+"""Between the slopes of a mesh whose settings name none, as on the command line."""
 
 MESSAGE_BYTES = 1_000_000
 """Size at which published arrays are split: larger messages cost more time a byte."""
@@ -234,11 +237,12 @@ def settings_from(message: msg.MeshSettings, name: str = "settings") -> MeshSett
     """Mesh settings of a message; raises InputError."""
     with _inside(name):
         initial = unpacked(message.initial_state, "d")
+        slopes = unpacked(message.slopes, "d")
         model = model_from(message.model)
         return MeshSettings(
             controller=controller_from(message.controller, model.robot),
             model=model,
-            slopes=unpacked(message.slopes, "d").copy(),
+            slopes=slopes.copy() if slopes.size else slope_set(DEFAULT_SLOPE_STEP_DEG),
             threshold=message.threshold,
             clustered=message.clustered,
             scale_refresh=message.scale_refresh or "generation",

@@ -53,6 +53,7 @@ class Progress:
         # A terminal gets its line at once; a log only if the work turns out to be long.
         self._next = self._start if self._terminal else self._start + self._interval
         self._shown = False
+        self._last = ""
         self._counted: tuple[str, float, int] | None = None
 
     @property
@@ -71,8 +72,9 @@ class Progress:
             width = _columns(self._stream) - 1
             self._stream.write(f"\r{text[:width]}\x1b[K")
             self._shown = True
-        else:
+        elif text != self._last:  # a log needs no line twice
             self._stream.write(text + "\n")
+            self._last = text
         self._stream.flush()
 
     def count(self, label: str, done: int, total: int, unit: str) -> None:
