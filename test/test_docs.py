@@ -42,7 +42,7 @@ def test_commands_are_understood(page):
 def test_commands_are_found():
     found = [words for page in PAGES for words in commands(page)]
     assert len(found) > 30
-    assert ["controllers", "hzd/mfpt"] in found
+    assert ["controllers", "hzd/mfpt", "--robot-file", "robot.json"] in found
 
 
 @pytest.mark.parametrize(

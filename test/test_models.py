@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
 
 from biped_mfpt_ros.cli import main
-from biped_mfpt_ros.control.controller import SCHEMES, controller
+from biped_mfpt_ros.control.controller import SCHEMES, Controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.models import model_from, model_values, robot_from, robot_from_file
@@ -75,6 +76,36 @@ def test_own_robot_and_controller_walk_as_they_do_in_the_library(tmp_path, capsy
     # Another robot walks otherwise.
     rabbits = find_limit_cycle(own, 0.0, WalkerModel()).state
     assert not np.allclose(rabbits, wanted.state, atol=1e-3)
+
+
+def test_a_gait_of_the_catalogue_is_made_hybrid_invariant_for_another_robot(tmp_path, capsys):
+    """Then its cycle on the flat does not depend on the gains: there is nothing to correct."""
+    robot = tmp_path / "heavy.json"
+    robot.write_text(json.dumps(dataclasses.asdict(HEAVY)))
+
+    def moves(*options):
+        """How far the cycle's state moves with twice the stiffness, rad and rad/s."""
+        assert main(["controllers", "hzd/mfpt", *options]) == 0
+        data = json.loads(capsys.readouterr().out)
+        states = []
+        for factor in (1.0, 2.0):
+            parameters = np.array(list(data["parameters"].values()))
+            parameters[0] *= factor
+            walking = Controller("mine", "hzd", parameters)
+            model = WalkerModel(robot=HEAVY, torque_limit=math.inf)
+            states.append(find_limit_cycle(walking, 0.0, model).state)
+        return np.abs(states[1] - states[0]).max()
+
+    assert moves() > 1e-4
+    # The residual of Newton's method, 1e-9, over one minus the second eigenvalue, some 0.5.
+    assert moves("--robot-file", str(robot)) < 1e-8
+
+
+def test_a_robot_is_for_a_controller_that_is_named(tmp_path, capsys):
+    robot = tmp_path / "heavy.json"
+    robot.write_text(json.dumps(dataclasses.asdict(HEAVY)))
+    assert main(["controllers", "--robot-file", str(robot)]) == 2
+    assert "NAME" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

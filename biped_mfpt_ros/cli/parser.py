@@ -878,15 +878,17 @@ def _add_controllers(add: Callable[..., Parser]) -> None:
         "single:controllers",
         "list the controllers: those of the paper with its figures, and others",
         """
-With NAME print one of them as --controller-file takes it, to be changed.
+With NAME print one of them as --controller-file takes it, to be changed. With the robot that it is
+for, coefficients alpha_0 and alpha_1 of hzd are those of hybrid invariance on it.
 
 examples:
   biped-mfpt controllers
-  biped-mfpt controllers hzd/mfpt > mine.json
+  biped-mfpt controllers hzd/mfpt --robot-file robot.json > mine.json
 """,
         "output",
     )
     controllers.add_argument("name", nargs="?", metavar="NAME", help="print this one as JSON")
+    controllers.add_argument("--robot-file", metavar="FILE", help="print it for this robot")
 
 
 def make_parser() -> Parser:

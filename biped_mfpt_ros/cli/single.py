@@ -21,6 +21,8 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo as walk
 from biped_mfpt_ros.gait.step import check_states, simulate_steps
+from biped_mfpt_ros.models import robot_from_file
+from biped_mfpt_ros.optimise.space import PARAMETRISATIONS
 from biped_mfpt_ros.report import paper
 from biped_mfpt_ros.report.tables import number, table
 from biped_mfpt_ros.walker.outcome import Outcome
@@ -136,12 +138,19 @@ def monte_carlo(args: argparse.Namespace) -> None:
 
 def controllers(args: argparse.Namespace) -> None:
     """List the catalogue, or print one controller of it."""
+    if args.robot_file is not None and args.name is None:
+        raise InputError("--robot-file", args.robot_file, "given with NAME only")
     if args.name is not None:
         try:
             one = catalogue()[args.name]
         except KeyError:
             raise InputError("NAME", args.name, "one of " + ", ".join(catalogue())) from None
-        parameters = dict(zip(SCHEMES[one.scheme].parameters, one.parameters, strict=True))
+        values = one.parameters
+        if args.robot_file is not None:
+            # What follows from the others on this robot: hybrid invariance.
+            made = PARAMETRISATIONS[one.scheme]
+            values = made.parameters(made.free(values), values, robot_from_file(args.robot_file))
+        parameters = dict(zip(SCHEMES[one.scheme].parameters, values, strict=True))
         # Not the catalogue's name: what is changed has none of the paper's numbers.
         print(json_text({"name": "mine", "scheme": one.scheme, "parameters": parameters}))
         return
