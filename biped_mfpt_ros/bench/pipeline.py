@@ -6,11 +6,13 @@ the step map, and of testing and targets, is taken in this process, on the same 
 
 from __future__ import annotations
 
+import re
 import time
 from typing import Any
 
 import numpy as np
 
+from biped_mfpt_ros.bench.bare import Bare
 from biped_mfpt_ros.bench.measure import SLOPES, BenchError, Section, row
 from biped_mfpt_ros.bench.nodes import Nodes, cpu_seconds
 from biped_mfpt_ros.chain.mesh import Mesh, grow_mesh
@@ -18,6 +20,8 @@ from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.step import Steps, simulate_steps
 from biped_mfpt_ros.nodes.messages import MeshSettings
+from biped_mfpt_ros.nodes.spin import keep_freed_memory
+from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
 
 CONTROLLER = controller("hzd/mfpt")
@@ -88,65 +92,95 @@ def small(nodes: Nodes, processes: dict[str, list[Any]], short: bool) -> Section
     return section
 
 
+def requests_of(nodes: Nodes) -> int:
+    """Requests that the mesher's last mesh took, as it logged them."""
+    found = re.findall(r"(\d+) requests, ", (nodes.directory / "mesher.log").read_text())
+    if not found:
+        raise BenchError("the mesher has logged no mesh")
+    return int(found[-1])
+
+
 def large(nodes: Nodes, processes: dict[str, list[Any]], short: bool) -> Section:
     """A mesh of some 1e4 states with one simulator and with two.
+
+    What the pipeline costs is that of one simulator, without what the step map, tests and targets
+    take in this process just before each mesh. The floor is what as many calls of as many bytes
+    take just after it, without a mesh: see `Bare`.
 
     The mesher needs a core, too. So two cores cannot be twice as fast with two simulators as with
     one: at best they share all that there is to compute, and that is the bound beside the
     efficiency.
     """
     settings = settings_of(0.02 if short else 0.0005)
-    repetitions = 2 if short else 5
-    here = [grow_here(settings) for _ in range(repetitions)]
-    n = len(here[0][0].states) - 1
-    step_map, beside = (min(times) for times in zip(*[grown[1:] for grown in here], strict=True))
+    repetitions = 2 if short else 9
+    mesh, _, _ = grow_here(settings)
+    n = len(mesh.states) - 1
+    successes = np.count_nonzero(mesh.outcomes[1:] == Outcome.STEP)
+    nodes.grow(settings)
+    requests = requests_of(nodes)
     section = Section()
     walls = {}
-    overhead = []
+    # Step map, tests and targets, mesher, simulator, floor.
+    times = np.empty((repetitions, 5))
+    seconds = np.empty(repetitions)
+    with Nodes() as others:
+        bare = Bare(others, round(n / requests), len(SLOPES), round(successes / requests))
+        bare.call(requests)
+        for i in range(repetitions):
+            times[i, :2] = grow_here(settings)[1:]
+            seconds[i], *times[i, 2:4] = one(nodes, processes, settings, n)
+            times[i, 4] = bare.call(requests)
     for simulators in (1, 2):
         if simulators == 2:
             processes["simulator"].append(nodes.start("simulator", "simulator_2"))
             nodes.wait(2)
             time.sleep(1.0)  # for the mesher to find it
-        seconds = []
-        for _ in range(repetitions):
-            before = {name: sum(map(cpu_seconds, group)) for name, group in processes.items()}
-            (result,) = nodes.grow(settings)
-            if (result.states, result.swings) != (n + 1, n):
-                raise BenchError(f"{result.states} states, {result.swings} swings; {n + 1} is due")
-            cpu = {
-                name: sum(map(cpu_seconds, group)) - before[name]
-                for name, group in processes.items()
-            }
-            seconds.append(result.seconds)
-            overhead.append((cpu["mesher"] - beside, cpu["simulator"] - step_map))
-        walls[simulators] = min(seconds)
-        section.rows.append(
-            row(f"mesh of {n + 1} states, {simulators} simulator(s)", np.array(seconds), 1, "s")
-        )
+            seconds = np.array([one(nodes, processes, settings, n)[0] for _ in range(repetitions)])
+        walls[simulators] = seconds.min()
+        what = f"mesh of {n + 1} states, {simulators} simulator(s)"
+        section.rows.append(row(what, seconds, 1, "s"))
+    names = ("step map", "tests and targets", "mesher", "simulator", "floor of rclpy")
+    for name, values in zip(names, times.T, strict=True):
+        section.rows.append(row(f"CPU a state, mesh of {n + 1}: {name}", values, n, "us"))
     # Differences of times, so a little below 0 now and then.
-    mesher, simulator = np.min(overhead, axis=0)
+    step_map, beside = np.median(times[:, :2], axis=0)
+    mesher, simulator = np.median(times[:, 2:4] - times[:, [1, 0]], axis=0)
+    floor = np.median(times[:, 4])
     section.facts.update(
         {
-            f"us of CPU a state, mesh of {n + 1}: {what}": round(1e6 * value / n, 2)
-            for what, value in (
-                ("step map", step_map),
-                ("tests and targets", beside),
-                ("mesher, all else", mesher),
-                ("simulator, all else", simulator),
-            )
+            f"us of CPU a state, mesh of {n + 1}: mesher, all else": round(1e6 * mesher / n, 2),
+            f"us of CPU a state, mesh of {n + 1}: simulator, all else": round(
+                1e6 * simulator / n, 2
+            ),
+            f"requests, mesh of {n + 1}": requests,
+            f"bytes of answers a state, mesh of {n + 1}": round(len(SLOPES) + 80 * successes / n),
         }
     )
+    all_work = step_map + beside + mesher + simulator
     section.ratios["efficiency_of_2_simulators"] = walls[1] / (2.0 * walls[2])
-    all_work = step_map + beside + float(mesher + simulator)
     section.ratios["its_bound_on_2_cores"] = min(1.0, walls[1] / all_work)
-    section.ratios["pipeline_over_step_map"] = float(mesher + simulator) / step_map
+    section.ratios["pipeline_over_step_map"] = (mesher + simulator) / step_map
+    section.ratios["floor_of_rclpy_over_step_map"] = floor / step_map
+    section.ratios["pipeline_without_floor_over_step_map"] = (mesher + simulator - floor) / step_map
     return section
+
+
+def one(
+    nodes: Nodes, processes: dict[str, list[Any]], settings: MeshSettings, n: int
+) -> tuple[float, float, float]:
+    """Grow a mesh of n states and x_1: its time, and the mesher's and simulators' CPU times, s."""
+    before = {name: sum(map(cpu_seconds, group)) for name, group in processes.items()}
+    (result,) = nodes.grow(settings)
+    if (result.states, result.swings) != (n + 1, n):
+        raise BenchError(f"{result.states} states, {result.swings} swings; {n + 1} is due")
+    cpu = {name: sum(map(cpu_seconds, group)) - before[name] for name, group in processes.items()}
+    return result.seconds, cpu["mesher"], cpu["simulator"]
 
 
 def run(short: bool) -> Section:
     """Grow meshes through mesher and simulators in processes of their own."""
     section = Section()
+    keep_freed_memory()  # as the nodes do
     with Nodes() as nodes:
         processes = {
             "mesher": [nodes.start("mesher", "mesher", meshes_at_once=max(IN_FLIGHT))],
