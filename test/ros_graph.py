@@ -14,12 +14,12 @@ import rclpy
 from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MeshInfo, MeshStates, MeshTransitions
 from biped_mfpt_msgs.srv import SimulateSteps
-from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from biped_mfpt_ros.nodes.answers import ActionClient, accepted
 from biped_mfpt_ros.nodes.assembly import MeshAssembly
 from biped_mfpt_ros.nodes.messages import settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
@@ -28,11 +28,11 @@ from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 DOMAIN = 1 + os.getpid() % 100
 
 
-STARTING = 120.0
-"""s, for nodes that may have to compile first, several of them on a busy machine."""
+PATIENCE = 300.0
+"""s, for what has to happen: nodes may have to compile first, several of them on a busy machine."""
 
 
-def wait_for(condition, what, timeout=20.0):
+def wait_for(condition, what, timeout=PATIENCE):
     """Wait until a condition is true, and return what it says."""
     deadline = time.monotonic() + timeout
     while not (found := condition()):
@@ -112,11 +112,10 @@ def ros_graph():
             del os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]
 
 
-def result_of(future, timeout=30.0):
-    done = threading.Event()
-    future.add_done_callback(lambda _: done.set())
-    assert done.wait(timeout), f"no answer within {timeout} s"
-    return future.result()
+def result_of(answer, timeout=PATIENCE):
+    """What a future, or an `Answer`, brings."""
+    wait_for(answer.done, "an answer", timeout)
+    return answer.result()
 
 
 class Client(Node):
@@ -165,7 +164,7 @@ class Client(Node):
         return self.service(SimulateSteps, name)
 
     def wait_for_mesher(self):
-        wait_for(self._grow.server_is_ready, "grow_mesh", STARTING)
+        wait_for(self._grow.server_is_ready, "grow_mesh")
 
     def send_goal(self, settings, feedback=None):
         """Handle of a goal; `settings` may be a message that is wrong."""
@@ -174,7 +173,9 @@ class Client(Node):
         self.wait_for_mesher()
         goal = GrowMesh.Goal(settings=settings)
         callback = None if feedback is None else lambda m: feedback(m.feedback.progress)
-        return result_of(self._grow.send_goal_async(goal, feedback_callback=callback))
+        return result_of(
+            accepted(lambda: self._grow.send_goal_async(goal, feedback_callback=callback))
+        )
 
     def send_goal_to(self, mesher, settings):
         """Handle of a goal for a mesher by the name of its node.
@@ -186,10 +187,8 @@ class Client(Node):
             announced = self.get_publishers_info_by_topic("/grow_mesh/_action/status")
             return any(i.node_name == mesher for i in announced) and self._grow.server_is_ready()
 
-        wait_for(reached, mesher, STARTING)
-        return result_of(
-            self._grow.send_goal_async(GrowMesh.Goal(settings=settings_message(settings)))
-        )
+        wait_for(reached, mesher)
+        return self.send_goal(settings)
 
     def grow(self, settings, feedback=None):
         """Status and result of a goal."""
@@ -197,7 +196,7 @@ class Client(Node):
         assert handle.accepted
         return self.outcome(handle)
 
-    def outcome(self, handle, timeout=60.0):
+    def outcome(self, handle, timeout=PATIENCE):
         answer = result_of(handle.get_result_async(), timeout)
         return answer.status, answer.result
 

@@ -101,13 +101,13 @@ def ask():
     """On host A: grow meshes, cut the link meanwhile, and restore it, until that was seen."""
     import rclpy
     from action_msgs.msg import GoalStatus
-    from ros_graph import STARTING, Client, Graph, wait_for
+    from ros_graph import Client, Graph, wait_for
     from test_processes import assert_same_mesh, grown_here, settings
 
     rclpy.init()
     graph = Graph()
     client = graph.start(Client)
-    wait_for(lambda: len(client.simulators()) >= 2, "simulators on both hosts", STARTING)
+    wait_for(lambda: len(client.simulators()) >= 2, "simulators on both hosts")
     client.wait_for_mesher()
     time.sleep(1.0)  # for one that should not be found to be found
     seen = len(client.simulators())

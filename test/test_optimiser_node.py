@@ -9,12 +9,12 @@ import pytest
 from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.action import Optimise
 from biped_mfpt_msgs.msg import OptimisationTrial
-from rclpy.action import ActionClient
 from rclpy.node import Node
-from ros_graph import STARTING, result_of, ros_graph, wait_for
+from ros_graph import result_of, ros_graph, wait_for
 
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.nodes.analysis import Analysis
+from biped_mfpt_ros.nodes.answers import ActionClient, accepted
 from biped_mfpt_ros.nodes.mesher import Mesher
 from biped_mfpt_ros.nodes.messages import controller_message
 from biped_mfpt_ros.nodes.optimiser import (
@@ -59,17 +59,19 @@ class Client(Node):
         self.action.destroy()
 
     def send(self, goal):
-        wait_for(self.action.server_is_ready, "the optimiser", STARTING)
+        wait_for(self.action.server_is_ready, "the optimiser")
         handle = result_of(
-            self.action.send_goal_async(
-                goal, feedback_callback=lambda m: self.feedback.append(m.feedback)
+            accepted(
+                lambda: self.action.send_goal_async(
+                    goal, feedback_callback=lambda m: self.feedback.append(m.feedback)
+                )
             )
         )
         assert handle.accepted
         return handle
 
-    def run(self, goal, timeout=120.0):
-        return result_of(self.send(goal).get_result_async(), timeout)
+    def run(self, goal):
+        return result_of(self.send(goal).get_result_async())
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +142,9 @@ def test_a_study_over_ros_is_that_of_this_process(client, store_path, tmp_path):
     best = max((t for t in trials if t.found.confirmed), key=lambda t: t.found.score)
     assert answer.result.best.trial == best.number
     wait_for(lambda: client.best and client.best[-1].trial == best.number, "the best")
-    assert len(client.feedback) == 20
+    # Of feedback only the latest counts: a slow reader may miss some.
+    wait_for(lambda: client.feedback and client.feedback[-1].trials == 20, "the last feedback")
+    assert len(client.feedback) <= 20
 
 
 def test_who_comes_late_gets_the_best(graph, client):
@@ -154,7 +158,7 @@ def test_a_cancelled_study_goes_on_later(client, store_path, tmp_path):
     goal = goal_message("two", SETTINGS)
     client.trials.clear()
     handle = client.send(goal)
-    wait_for(lambda: len(client.trials) > 4, "some trials", 60.0)
+    wait_for(lambda: len(client.trials) > 4, "some trials")
     # Meanwhile there is no room for another one.
     answer = client.run(goal_message("three", SETTINGS))
     assert answer.status == GoalStatus.STATUS_ABORTED
@@ -169,26 +173,32 @@ def test_a_cancelled_study_goes_on_later(client, store_path, tmp_path):
     assert outline(kept(store_path, "two")) == locally(tmp_path / "l.sqlite", goal.max_trials)
 
 
-def test_a_flood_of_goals_and_cancels_leaves_a_study_alone(client, store_path, tmp_path):
+def test_a_flood_of_goals_and_cancels_leaves_a_study_alone(
+    client, store_path, tmp_path, monkeypatch
+):
+    # However slow the machine is, the flood is over by then.
+    monkeypatch.setattr("biped_mfpt_ros.nodes.optimiser._WITHIN", 1e6)
     client.trials.clear()
     running = client.send(goal_message("flooded", SETTINGS))
-    wait_for(lambda: client.trials, "a trial", 60.0)
+    wait_for(lambda: client.trials, "a trial")
     # In bursts that the queues of an action hold, ten each: the middleware drops the rest.
-    handles = []
+    told = []
     for _ in range(30):
         burst = [client.action.send_goal_async(goal_message("more", SETTINGS)) for _ in range(8)]
-        handles += [result_of(future) for future in burst]
-    accepted = [handle for handle in handles if handle.accepted]
-    # Goals of the 10 s before count, and on a slow machine some of the next 10 s are let in.
-    assert MOST_REFUSED // 2 < len(accepted) <= 2 * MOST_REFUSED
-    for handle in accepted:
+        taken = [handle for handle in map(result_of, burst) if handle.accepted]
+        # At once, since rclpy keeps results for 10 s only.
+        told += [(handle, handle.get_result_async()) for handle in taken]
+    # Goals of other tests count too.
+    assert MOST_REFUSED // 2 < len(told) <= MOST_REFUSED
+    for handle, _ in told:
         result_of(handle.cancel_goal_async())
-    for handle in accepted:
-        answer = result_of(handle.get_result_async())
+    for _, result in told:
+        answer = result_of(result)
         assert answer.status in (GoalStatus.STATUS_ABORTED, GoalStatus.STATUS_CANCELED)
         assert "another study is running" in answer.result.message
     before = len(client.trials)
-    wait_for(lambda: len(client.trials) > before + 5, "more trials of the study", 60.0)
+    # Three generations, so that the first 20 trials are done.
+    wait_for(lambda: len(client.trials) > max(before + 5, 40), "more trials of the study")
     result_of(running.cancel_goal_async())
     answer = result_of(running.get_result_async())
     assert (answer.status, answer.result.message) == (GoalStatus.STATUS_CANCELED, "stopped")
@@ -291,11 +301,11 @@ def test_a_node_that_is_replaced_costs_nothing(graph, client, store_path, tmp_pa
     goal.max_trials = 30
     client.trials.clear()
     result = client.send(goal).get_result_async()
-    wait_for(lambda: len(client.trials) > 5, "some trials", 60.0)
+    wait_for(lambda: len(client.trials) > 5, "some trials")
     node = next(node for node, _, _ in graph._nodes if isinstance(node, kind))
     graph.stop(node)
     graph.start(kind)
-    assert result_of(result, 100.0).result.success
+    assert result_of(result).result.success
     assert outline(kept(store_path, goal.study)) == locally(tmp_path / "l.sqlite", 30)
 
 
@@ -315,14 +325,14 @@ def test_a_node_that_dies_costs_no_study(graph, victim, tmp_path):
     goal = goal_message("killed", SETTINGS)
     goal.max_trials = 40
     result = client.send(goal).get_result_async()
-    wait_for(lambda: len(client.trials) > 5, "some trials", STARTING)
+    wait_for(lambda: len(client.trials) > 5, "some trials")
     processes[victim].send_signal(signal.SIGKILL)
     processes[victim].wait()
     if victim == "optimiser":  # the graph takes a while to notice
-        wait_for(lambda: not client.action.server_is_ready(), "its end", STARTING)
+        wait_for(lambda: not client.action.server_is_ready(), "its end")
     launch(victim)
     if victim == "optimiser":  # the study goes on when it is asked for again
         result = client.send(goal).get_result_async()
-    assert result_of(result, STARTING).result.success
+    assert result_of(result).result.success
     graph.stop(client)
     assert outline(kept(path, "killed")) == locally(tmp_path / "l.sqlite", 40)

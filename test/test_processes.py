@@ -9,7 +9,7 @@ import time
 import pytest
 from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.msg import MfptEstimate
-from ros_graph import DOMAIN, STARTING, Client, ros_graph, wait_for
+from ros_graph import DOMAIN, Client, ros_graph, wait_for
 
 from biped_mfpt_ros import cli
 from biped_mfpt_ros.chain.mesh import grow_mesh
@@ -68,7 +68,7 @@ def simulators(graph, client, count):
     """Start simulators until there are so many; all processes that have been started."""
     before = len(client.simulators())
     started = [graph.launch("simulator") for _ in range(count - before)]
-    wait_for(lambda: len(client.simulators()) == count, f"{count} simulators", STARTING)
+    wait_for(lambda: len(client.simulators()) == count, f"{count} simulators")
     return started
 
 

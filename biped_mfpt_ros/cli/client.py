@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MeshProgress as MeshProgressMsg
 from biped_mfpt_msgs.msg import MfptEstimate
 from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
-from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -22,13 +20,13 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from biped_mfpt_ros.cli import CommandError, leaving
+from biped_mfpt_ros.nodes.answers import ActionClient, Answer, accepted
 from biped_mfpt_ros.nodes.fair_service import client_name
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 from biped_mfpt_ros.nodes.spin import security_explained
 
 _POLL = 0.05  # s
-_RESEND = 5.0  # s without an answer, after which a goal is sent again
 # What a recorder has to hear of a run: it finds each of them by itself, some tenths of a second
 # after its publisher, and a small mesh is grown and solved in less.
 RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
@@ -75,7 +73,7 @@ class Client:
         self._name = client_name(self._node)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._actions: list[ActionClient[Any, Any, Any]] = []
+        self._actions: list[ActionClient] = []
         self._grow = self._action(GrowMesh, "grow_mesh")
         self._compute = self._node.create_client(ComputeMfpt, "compute_mfpt", qos_profile=REQUESTS)
         self._estimates: list[MfptEstimate] = []
@@ -99,7 +97,7 @@ class Client:
             node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
-    def _action(self, kind: Any, name: str) -> ActionClient[Any, Any, Any]:
+    def _action(self, kind: Any, name: str) -> ActionClient:
         """A client of an action, to be destroyed at the end."""
         self._actions.append(ActionClient(self._node, kind, name))
         return self._actions[-1]
@@ -194,18 +192,10 @@ class Client:
             If the mesher refuses, or the mesh fails.
         """
         goal = GrowMesh.Goal(settings=settings_message(settings))
-        handle = None
-        # A mesher that was killed stays on the graph for a while: a goal that went to it is lost.
-        while handle is None:
-            handle = self._result(
-                self._grow.send_goal_async(
-                    goal, feedback_callback=lambda message: feedback(message.feedback.progress)
-                ),
-                _RESEND,
-            )
+        handle = self._accepted(self._grow, goal, lambda told: feedback(told.progress))
         if not handle.accepted:
             raise CommandError("the mesher refused the mesh; its log says why")
-        result: GrowMesh.Result = self._result(handle.get_result_async()).result
+        result: GrowMesh.Result = self._result(Answer(handle.get_result_async)).result
         if not result.success:
             raise CommandError(f"the mesh failed: {result.message}")
         return result
@@ -233,7 +223,11 @@ class Client:
         return self.answer(self.ask_mfpt(mesh_id, mu_s, sigma_s))
 
     def ask_mfpt(self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]) -> Future:
-        """Ask as `compute_mfpt` does, without waiting for the `answer`."""
+        """Ask as `compute_mfpt` does, without waiting for the `answer`.
+
+        It may cost much, so it is asked once: an analysis of which an estimate has come has found
+        this client, and loses no answer.
+        """
         return self._compute.call_async(
             ComputeMfpt.Request(
                 mesh_id=mesh_id,
@@ -250,12 +244,21 @@ class Client:
             raise AnalysisFailed(f"the analysis failed: {response.message}")
         return list(response.estimates)
 
-    def _result(self, future: Future, timeout: float = math.inf) -> Any:
-        """The result of a future; None if it has none after ``timeout`` seconds."""
-        deadline = time.monotonic() + timeout
-        while not future.done() and time.monotonic() < deadline:
+    def _accepted(self, action: ActionClient, goal: Any, feedback: Callable[[Any], object]) -> Any:
+        """Handle of a goal, when it has been answered."""
+        return self._result(
+            accepted(
+                lambda: action.send_goal_async(
+                    goal, feedback_callback=lambda message: feedback(message.feedback)
+                )
+            )
+        )
+
+    def _result(self, answer: Answer | Future) -> Any:
+        """An answer, when it has come."""
+        while not answer.done():
             self._spin()
-        return future.result() if future.done() else None
+        return answer.result()
 
     def _spin(self) -> None:
         self._executor.spin_once(timeout_sec=_POLL)

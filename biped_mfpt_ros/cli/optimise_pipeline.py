@@ -15,6 +15,7 @@ from biped_mfpt_ros.cli import CommandError
 from biped_mfpt_ros.cli.client import Client
 from biped_mfpt_ros.cli.pipeline import START_TIMEOUT, Pipeline, quoted
 from biped_mfpt_ros.cli.processes import Child, Processes
+from biped_mfpt_ros.nodes.answers import Answer
 from biped_mfpt_ros.nodes.optimiser import degrees_of, goal_message
 from biped_mfpt_ros.nodes.spin import prepare_environment
 from biped_mfpt_ros.optimise.settings import StudySettings
@@ -72,12 +73,10 @@ class StudyClient(Client):
 
     def optimise(self, goal: Optimise.Goal, feedback: Callable[[Any], object]) -> str:
         """Have a study run, telling of each trial (a message); why it ended."""
-        handle = self._result(
-            self._optimise.send_goal_async(
-                goal, feedback_callback=lambda message: feedback(message.feedback.trial)
-            )
-        )
-        result = self._result(handle.get_result_async()).result
+        handle = self._accepted(self._optimise, goal, lambda told: feedback(told.trial))
+        if not handle.accepted:
+            raise CommandError("the optimiser refused the study; its log says why")
+        result = self._result(Answer(handle.get_result_async)).result
         if not result.success:
             raise CommandError(result.message)
         return str(result.message)

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MfptEstimate
 from biped_mfpt_msgs.srv import ComputeMfpt
-from rclpy.action import ActionClient
 from rclpy.node import Node
-from rclpy.task import Future
 
 from biped_mfpt_ros.gait.cycle import LimitCycle
+from biped_mfpt_ros.nodes.answers import ActionClient, Answer, accepted
 from biped_mfpt_ros.nodes.fair_service import client_name
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
@@ -127,11 +128,12 @@ class PipelineBackend:
                 time.sleep(_LOOK)
                 continue
             mesher = self._publishers(self._of_mesher)
-            handle = self._result(self._grow.send_goal_async(goal), mesher, check)
+            sent = accepted(lambda: self._grow.send_goal_async(goal))
+            handle = self._result(sent, mesher, check)
             if handle is not None and not handle.accepted:  # too many are waiting
                 time.sleep(_LOOK)
         try:
-            response = self._result(handle.get_result_async(), mesher, check)
+            response = self._result(Answer(handle.get_result_async), mesher, check)
         except BaseException:
             handle.cancel_goal_async()
             raise
@@ -142,19 +144,16 @@ class PipelineBackend:
         found = self._node.get_publishers_info_by_topic(topic)
         return {bytes(info.endpoint_gid) for info in found}
 
-    def _result(self, future: Future[Any], asked: set[bytes], check: Check, topic: str = "") -> Any:
-        """What a future brings, or None if who was asked, the mesher by default, is gone."""
-        done = threading.Event()
-        future.add_done_callback(lambda _: done.set())
+    def _result(self, answer: Answer, asked: set[bytes], check: Check, topic: str = "") -> Any:
+        """An answer, or None if who was asked, the mesher by default, is gone."""
         look = time.monotonic() + _ALIVE
-        while not done.wait(_LOOK):
+        while not answer.come.wait(_LOOK) and not answer.done():
             check()
             if time.monotonic() > look:
                 look = time.monotonic() + _ALIVE
                 if not self._publishers(topic or self._of_mesher) & asked:
-                    future.cancel()
                     return None
-        return future.result()
+        return answer.result()
 
     def _on_estimate(self, estimate: MfptEstimate) -> None:
         with self._arrived:
@@ -194,8 +193,16 @@ class PipelineBackend:
             check()
             if self._compute.service_is_ready():
                 analysis = self._publishers(self._of_analysis)
-                future = self._compute.call_async(request)
-                response = self._result(future, analysis, check, self._of_analysis)
+                # A chain may cost much, so that is asked for once, when the analysis has answered
+                # what costs nothing: then it has found this client.
+                for asked, again in (
+                    (ComputeMfpt.Request(client=self._name), None),
+                    (request, math.inf),
+                ):
+                    answer = Answer(partial(self._compute.call_async, asked), again=again)
+                    response = self._result(answer, analysis, check, self._of_analysis)
+                    if response is None:
+                        break
                 if response is not None and response.success:
                     return float(response.estimates[0].mfpt)
                 if response is not None:

@@ -42,6 +42,7 @@ from biped_mfpt_ros.bench.nodes import Nodes, end, held
 from biped_mfpt_ros.control.controller import controller, controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.nodes import messages
+from biped_mfpt_ros.nodes.answers import Answer, accepted
 from biped_mfpt_ros.nodes.optimiser import goal_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 from biped_mfpt_ros.optimise.settings import Stage, StudySettings
@@ -134,7 +135,7 @@ class Live:
         self._wait(client.service_is_ready, name, _START)
         return lambda request: self.result(client.call_async(request), name)
 
-    def result(self, future: Future[Any], what: str) -> Any:
+    def result(self, future: Future[Any] | Answer, what: str) -> Any:
         """What a future brings."""
         self._wait(future.done, f"an answer of {what}", _PATIENCE)
         return future.result()
@@ -185,7 +186,7 @@ class Live:
 
     def goal(self, client: ActionClient[Any, Any, Any], goal: Any, seconds: float) -> Any:
         """Result of a goal, which is cancelled after some seconds."""
-        handle = self.result(client.send_goal_async(goal), "an action")
+        handle = self.result(accepted(lambda: client.send_goal_async(goal)), "an action")
         check(handle.accepted, "a goal was rejected, which does not say why")
         ended = handle.get_result_async()
         deadline = time.monotonic() + seconds
