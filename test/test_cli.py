@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ros_graph import DOMAIN, PATIENCE, ros_graph
+from test_resume import Counting
 
 from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.cli.output import json_text
@@ -230,20 +232,19 @@ class TestBadInput:
 
 
 def test_second_interrupt_does_not_wait_for_threads():
-    # Blocks of walks take minutes here, and threads cannot be interrupted.
+    # Blocks of walks take hours here, and threads cannot be interrupted.
     arguments = ["monte-carlo", "--controller", "smc/mfpt", "--sigma", "0.1", "--walks", "640"]
+    arguments += ["--max-steps", "100000000"]
     with subprocess.Popen([*COMMAND, *arguments], stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + PATIENCE
         # Imports take some two seconds of that, the rest is walking.
         while _cpu_seconds(process.pid) < 5.0:
             assert time.monotonic() < deadline
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
         time.sleep(0.5)
-        start = time.monotonic()
         process.send_signal(signal.SIGINT)
-        assert process.wait(10.0) == 130
-        assert time.monotonic() - start < 2.0
+        assert process.wait(PATIENCE) == 130
 
 
 def _cpu_seconds(pid):
@@ -379,17 +380,17 @@ def test_json_text():
 
 
 # A child that ends on SIGTERM, one that does not, and a program that starts one and waits.
-SLEEP = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
+SLEEP = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(600)"]
 STUBBORN = [
     sys.executable,
     "-c",
     "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
-    "print('up', flush=True); time.sleep(60)",
+    "print('up', flush=True); time.sleep(600)",
 ]
 
 
 def wait_until_up(child):
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + PATIENCE
     while "up" not in child.log.read_text():
         assert time.monotonic() < deadline, "the child does not start"
         time.sleep(0.01)
@@ -417,7 +418,9 @@ class TestProcesses:
         for number, handler in before.items():
             signal.signal(number, handler)
 
-    def test_stops_in_order(self, tmp_path):
+    def test_stops_in_order(self, tmp_path, monkeypatch):
+        for grace in ("_GRACE", "_LAST_GRACE"):
+            monkeypatch.setattr(f"biped_mfpt_ros.cli.processes.{grace}", PATIENCE)
         script = (
             "import pathlib, signal, sys, time\n"
             "def end(*_):\n"
@@ -425,7 +428,7 @@ class TestProcesses:
             "    sys.exit(0)\n"
             "signal.signal(signal.SIGTERM, end)\n"
             "print('up', flush=True)\n"
-            "time.sleep(60)\n"
+            "time.sleep(600)\n"
         )
         order = tmp_path / "order"
         with Processes(tmp_path / "logs") as processes:
@@ -442,8 +445,6 @@ class TestProcesses:
         with Processes(tmp_path) as processes:
             child = processes.start("stubborn", STUBBORN)
             wait_until_up(child)
-            start = time.monotonic()
-        assert time.monotonic() - start < 5.0
         assert child.process.returncode == -signal.SIGKILL
         assert child.ending() == "was killed by SIGKILL"
 
@@ -452,7 +453,7 @@ class TestProcesses:
             command = [sys.executable, "-c", "print('last words'); raise SystemExit(3)"]
             child = processes.start("short", command)
             other = processes.start("long", SLEEP)
-            child.process.wait(20)
+            child.process.wait(PATIENCE)
             assert processes.newly_ended() == [child]
             assert processes.newly_ended() == []
             assert child.ending() == "ended with code 3"
@@ -476,23 +477,31 @@ class TestProcesses:
         assert processes.running() == []
         assert signal.getsignal(number) is handler
 
-    def test_second_signal_does_not_wait(self, tmp_path):
+    @pytest.mark.parametrize("last", [False, True])
+    def test_second_signal_does_not_wait(self, tmp_path, monkeypatch, last):
+        for grace in ("_GRACE", "_LAST_GRACE"):
+            monkeypatch.setattr(f"biped_mfpt_ros.cli.processes.{grace}", 2.0 * PATIENCE)
+        # One that does not end; that it is asked to brings the second signal.
+        code = (
+            "import os, signal, time\n"
+            f"signal.signal(signal.SIGTERM, lambda *_: os.kill({os.getpid()}, signal.SIGINT))\n"
+            "print('up', flush=True)\n"
+            "while True: time.sleep(600)\n"
+        )
         processes = Processes(tmp_path)
-        code = f"import os, time; time.sleep(0.3); os.kill({os.getpid()}, 2)"
 
         def run():
             with processes:
-                wait_until_up(processes.start("stubborn", STUBBORN))
-                later.append(subprocess.Popen([sys.executable, "-c", code]))
+                stubborn.append(processes.start("s", [sys.executable, "-c", code], last=last))
+                wait_until_up(stubborn[0])
                 start.append(time.monotonic())
                 os.kill(os.getpid(), signal.SIGINT)
 
-        start, later = [], []
+        start, stubborn = [], []
         with pytest.raises(Stopped):
             run()
-        assert time.monotonic() - start[0] < 2.0  # the grace alone takes 2 s
-        later[0].wait()
-        assert processes.running() == []
+        assert time.monotonic() - start[0] < PATIENCE
+        assert stubborn[0].ending() == "was killed by SIGKILL"
 
     def test_children_end_with_a_killed_parent(self, tmp_path):
         child = (
@@ -500,7 +509,7 @@ class TestProcesses:
             "from biped_mfpt_ros.cli.node import end_with\n"
             "end_with(int(sys.argv[1]))\n"
             "print('up', flush=True)\n"
-            "time.sleep(60)\n"
+            "time.sleep(600)\n"
         )
         parent = (
             "import os, pathlib, sys, time\n"
@@ -510,14 +519,14 @@ class TestProcesses:
             "    child = processes.start('child', command)\n"
             "    while 'up' not in child.log.read_text(): time.sleep(0.01)\n"
             "    print(child.process.pid, flush=True)\n"
-            "    time.sleep(60)\n"
+            "    time.sleep(600)\n"
         )
         command = [sys.executable, "-c", parent, str(tmp_path)]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
             pid = int(process.stdout.readline())
             assert alive(pid)
             process.kill()
-        deadline = time.monotonic() + 5.0
+        deadline = time.monotonic() + PATIENCE
         while alive(pid):
             assert time.monotonic() < deadline, "the child outlives its parent"
             time.sleep(0.01)
@@ -567,7 +576,7 @@ class Run:
             lambda: any(path.stat().st_size > 10_000 for path in bag.glob("*.mcap")), self, "a bag"
         )
 
-    def end(self, timeout=60.0):
+    def end(self, timeout=PATIENCE):
         try:
             out, err = self.process.communicate(timeout=timeout)
         except subprocess.TimeoutExpired:
@@ -576,7 +585,7 @@ class Run:
         return self.process.returncode, out, err
 
 
-def wait_until(condition, run, what, timeout=60.0):
+def wait_until(condition, run, what, timeout=PATIENCE):
     deadline = time.monotonic() + timeout
     while not condition():
         if run.process.poll() is not None:
@@ -634,11 +643,9 @@ class TestRun:
     def test_signal_stops_everything_and_closes_the_bag(self, tmp_path, number):
         run = Run(tmp_path, *LONG)
         run.wait_for_mesh()
-        start = time.monotonic()
         run.process.send_signal(number)
         code, _, err = run.end()
         assert code == 130, err
-        assert time.monotonic() - start < 5.0
         assert run.nodes() == {}
         assert (tmp_path / "run" / "bag" / "metadata.yaml").exists()
 
@@ -648,7 +655,7 @@ class TestRun:
         run.process.kill()
         start = time.monotonic()
         while run.nodes():
-            assert time.monotonic() - start < 5.0, run.nodes()
+            assert time.monotonic() - start < PATIENCE, run.nodes()
             time.sleep(0.05)
         run.end()
         assert (tmp_path / "run" / "bag" / "metadata.yaml").exists()
@@ -665,18 +672,25 @@ class TestRun:
         assert not run_checkpoint(run).exists()
 
     def test_a_mesher_that_is_killed_is_replaced_and_the_mesh_goes_on(self, tmp_path, capsys):
-        # 27612 states: a second, of which the first tenth is enough to be seen.
-        arguments = ("--threshold", "1e-4", "--sigma", "2")
+        arguments = ("--threshold", "0.002", "--sigma", "2")
         more = ("--workers", "1", "--walks", "0", "--json", "--output", "run")
-        run = Run(tmp_path, *arguments, *more)
-        kept = run_checkpoint(run)
-        wait_until(
-            lambda: any(path.stat().st_size > 20_000 for path in kept.glob("*.journal")),
-            run,
-            "the mesh to grow",
-        )
-        os.kill(run.nodes()["mesher"][0], signal.SIGKILL)
-        code, out, err = run.end(120.0)
+        with ros_graph() as graph, pytest.MonkeyPatch.context() as patch:
+            patch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+            run = Run(tmp_path, *arguments, *more, "--namespace", "killed")
+            # In the place of its own simulator, and held before the mesh is complete.
+            wait_until(lambda: "simulator" in run.nodes(), run, "its simulator")
+            os.kill(run.nodes()["simulator"][0], signal.SIGSTOP)
+            simulator = graph.start(lambda: Counting("killed_simulator", namespace="/killed"))
+            simulator.hold_after(50)
+            kept = run_checkpoint(run)
+            wait_until(
+                lambda: any(path.stat().st_size > 20_000 for path in kept.glob("*.journal")),
+                run,
+                "the mesh to grow",
+            )
+            os.kill(run.nodes()["mesher"][0], signal.SIGKILL)
+            simulator.release()
+            code, out, err = run.end()
         assert code == 0, err
         assert "starting another one, which goes on where it was" in err
         result = json.loads(out)
@@ -694,7 +708,7 @@ class TestRun:
             (tmp_path / name).mkdir()
             runs.append(Run(tmp_path / name, *arguments, "--workers", "1"))
         for run in runs:
-            code, out, err = run.end(120.0)
+            code, out, err = run.end()
             assert code == 0, err
             namespace = json.loads(out)["namespace"]
             inspected = run_json(capsys, "inspect", str(run.directory / "run" / "bag"))

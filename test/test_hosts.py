@@ -80,13 +80,13 @@ def test_mesh_is_the_same_although_the_link_between_two_hosts_is_cut(tmp_path):
                 env={**os.environ, **network, "PYTHONPATH": str(Path(__file__).parents[1])},
                 stdout=subprocess.PIPE,
                 text=True,
-                timeout=400.0,
+                timeout=1200.0,
             )
         finally:
             for node in nodes:
                 node.terminate()
             for node in nodes:
-                node.communicate(timeout=20.0)
+                node.communicate(timeout=120.0)
     assert asked.returncode == 0
     result = json.loads(asked.stdout)
     assert result["simulators_seen"] == 2
@@ -128,7 +128,7 @@ def ask():
                 threading.Timer(1.0, ip, ("link", "set", LINK, "up")).start()
 
         handle = client.send_goal(wanted, feedback)
-        status, grown = client.outcome(handle, 120.0)
+        status, grown = client.outcome(handle)
         assert status == GoalStatus.STATUS_SUCCEEDED, grown.message
         assert_same_mesh(client.mesh(grown.mesh_id), here)
         result["meshes"] += 1

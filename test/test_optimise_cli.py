@@ -184,22 +184,23 @@ def test_what_is_not_there_is_told(finished, tmp_path, capsys):
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_study_that_was_killed_goes_on(tmp_path, number):
     path = tmp_path / "killed.sqlite"
+    # Without an end, so that it is not done before it is stopped.
     command = [sys.executable, "-m", "biped_mfpt_ros.cli", "optimise", *QUICK,
-               "--store", str(path), "--study", "s", "--trials", "60"]  # fmt: skip
+               "--store", str(path), "--study", "s"]  # fmt: skip
     process = subprocess.Popen(command, env=dict(os.environ))
-    deadline = time.monotonic() + 200.0
+    deadline = time.monotonic() + 300.0
     while not path.exists() or len(outline_so_far(path)) < 8:
         assert time.monotonic() < deadline
-        assert process.poll() is None, "it was done before it could be stopped"
+        assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(number)
     process.wait()
     before = outline(path)
-    assert len(before) < 60
-    assert optimise(path, "--trials", "60") == 0
+    trials = ("--trials", str(max(60, len(before) + 20)))
+    assert optimise(path, *trials) == 0
     after = outline(path)
-    assert after[: len(before)] == before or set(map(str, before)) <= set(map(str, after))
-    assert optimise(tmp_path / "whole.sqlite", "--trials", "60", "--workers", "1") == 0
+    assert set(map(str, before)) < set(map(str, after))
+    assert optimise(tmp_path / "whole.sqlite", *trials, "--workers", "1") == 0
     assert after == outline(tmp_path / "whole.sqlite")
 
 

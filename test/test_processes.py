@@ -9,7 +9,7 @@ import time
 import pytest
 from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.msg import MfptEstimate
-from ros_graph import DOMAIN, Client, ros_graph, wait_for
+from ros_graph import DOMAIN, PATIENCE, Client, ros_graph, wait_for
 
 from biped_mfpt_ros import cli
 from biped_mfpt_ros.chain.mesh import grow_mesh
@@ -57,10 +57,10 @@ def stop(process, number):
     """Exit code and what was written to stderr, after a signal."""
     process.send_signal(number)
     try:
-        _, written = process.communicate(timeout=10.0)
+        _, written = process.communicate(timeout=PATIENCE)
     except subprocess.TimeoutExpired:
         process.kill()
-        pytest.fail(f"still running 10 s after signal {number}: {process.communicate()[1]}")
+        pytest.fail(f"still running {PATIENCE} s after signal {number}: {process.communicate()[1]}")
     return process.returncode, written
 
 
@@ -113,8 +113,8 @@ def test_pipeline_of_processes(graph, client):
     victim, woken, *_ = started
     victim.send_signal(signal.SIGSTOP)
     woken.send_signal(signal.SIGSTOP)
+    seen = []
     handle = client.send_goal(finer, seen.append)
-    seen.clear()
     wait_for(lambda: seen and seen[-1].chunks_repeated, "chunks to be handed on")
     victim.kill()
     woken.send_signal(signal.SIGCONT)
@@ -125,8 +125,8 @@ def test_pipeline_of_processes(graph, client):
     assert_same_mesh(client.mesh(result.mesh_id), grown_here(finer))
 
     # A mesh that is being grown does not keep anyone from stopping cleanly.
+    seen = []
     handle = client.send_goal(settings("hzd/mfpt", 0.001), seen.append)
-    seen.clear()
     wait_for(lambda: seen and seen[-1].swings > 100, "the mesh to grow")
     running = [*others, *(process for process in started if process is not victim)]
     for number, process in zip((signal.SIGTERM, signal.SIGINT) * 3, running, strict=False):
@@ -158,7 +158,7 @@ def test_nodes_that_cannot_start_say_why(graph, tmp_path):
         ),
     ]
     for process, said in cases:
-        _, written = process.communicate(timeout=60.0)
+        _, written = process.communicate(timeout=PATIENCE)
         assert process.returncode == 2
         assert said in written
         assert "; allowed: " in written
@@ -182,7 +182,7 @@ def test_a_process_ends_in_time_whatever_holds_the_interpreter():
         "re.match('(a+)+b', 'a' * 60)"
     )
     start = time.monotonic()
-    ended = subprocess.run([sys.executable, "-c", code], timeout=20.0, check=False)
+    ended = subprocess.run([sys.executable, "-c", code], timeout=PATIENCE, check=False)
     assert ended.returncode == 0
     assert time.monotonic() - start > 1.0
 
@@ -216,7 +216,7 @@ sys.exit(cli.main(["cycle"]))
     ended = subprocess.run(
         [sys.executable, "-c", program],
         env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "PYTHONUNBUFFERED": ""},
-        capture_output=True, text=True, timeout=30.0, check=False,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert ended.returncode == code, ended.stderr
     assert ended.stdout == "all of it\n"

@@ -18,7 +18,7 @@ from biped_mfpt_msgs import msg as messages
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
-from ros_graph import ros_graph, wait_for
+from ros_graph import PATIENCE, ros_graph, wait_for
 from rosbags.highlevel import AnyReader
 
 from biped_mfpt_ros.bag import Bag, BagError, inspect_bag, salvage
@@ -54,16 +54,14 @@ class Publisher(Node):
         self._publishers_by_topic[topic]._sequence += number
 
     def is_recorded(self, topic):
-        return any(
-            info.node_name == "recorder"
-            for info in self.get_subscriptions_info_by_topic(f"/run/{topic}")
-        )
+        """Whether what is published from now on reaches the recorder."""
+        return self._publishers_by_topic[topic]._publisher.get_subscription_count() > 0
 
     def wait_until_received(self, topic):
         """Wait until the recorder has acknowledged all messages."""
+        wait_for(lambda: self.is_recorded(topic), "the recorder")
         publisher = self._publishers_by_topic[topic]._publisher
-        wait_for(publisher.get_subscription_count, "the recorder")
-        assert publisher.wait_for_all_acked(Duration(seconds=20))
+        assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
 
 
 @pytest.fixture
@@ -96,7 +94,7 @@ def small_disk(path, size):
 def stop(process, how=signal.SIGTERM):
     """Exit code and log of a recorder."""
     process.send_signal(how)
-    _, log = process.communicate(timeout=20.0)
+    _, log = process.communicate(timeout=PATIENCE)
     return process.returncode, log
 
 
@@ -109,6 +107,11 @@ def flushed(bag: Path) -> Counter[str]:
     """Messages by topic in a bag that is being recorded."""
     unfinished = Bag(bag, unfinished=True)
     return Counter(raw.topic for raw in unfinished.raw_messages(on_error=lambda problem: None))
+
+
+def is_flushed(bag: Path, text: bytes) -> bool:
+    unfinished = Bag(bag, unfinished=True)
+    return any(text in raw.data for raw in unfinished.raw_messages(on_error=lambda problem: None))
 
 
 def recorded_states(bag: Path) -> list[messages.MeshStates]:
@@ -142,6 +145,7 @@ def test_everything_published_is_in_the_bag(graph, tmp_path):
     sent = {topic: len(all_sent) for topic, all_sent in publisher.sent.items()}
     del sent["/run/mesh/progress"]  # not latched: there may be fewer
     wait_for(lambda: sent.items() <= flushed(bag).items(), "all to be flushed")
+    wait_for(lambda: is_flushed(bag, b"a line of the log"), "the log to be flushed")
     with pytest.raises(BagError, match="still being recorded"):
         Bag(bag)
     saved = salvage(bag, tmp_path / "saved").counts
@@ -186,8 +190,8 @@ def test_everything_published_is_in_the_bag(graph, tmp_path):
         assert qos.durability.name == ("TRANSIENT_LOCAL" if latched else "VOLATILE")
         assert qos.reliability.name == "RELIABLE"
     for message in Bag(bag).messages():
-        assert 0 <= message.log_time - message.publish_time < 60e9
-        assert abs(message.log_time - time.time_ns()) < 60e9
+        assert 0 <= message.log_time - message.publish_time < 1e9 * PATIENCE
+        assert abs(message.log_time - time.time_ns()) < 1e9 * PATIENCE
     for topic, sent in publisher.sent.items():
         assert f"{topic}: received {len(sent)} messages of {len(sent)} published" in log
         assert saved[topic] == len(sent)  # while it was being recorded
@@ -200,8 +204,7 @@ def test_recorder_may_leave_out_what_was_before(graph, tmp_path, earlier):
     for _ in range(2):
         publisher.send("mesh/info", messages.MeshInfo(mesh_id="before"))
     process = record(graph, bag, "-p", f"earlier:={str(earlier).lower()}")
-    matched = publisher._publishers_by_topic["mesh/info"]._publisher.get_subscription_count
-    wait_for(matched, "the recorder")
+    wait_for(lambda: publisher.is_recorded("mesh/info"), "the recorder")
     publisher.send("mesh/info", messages.MeshInfo(mesh_id="mine"))
     publisher.wait_until_received("mesh/info")
     code, log = stop(process)
@@ -235,6 +238,38 @@ def test_lost_messages_are_errors_in_the_log(graph, tmp_path):
     assert Bag(tmp_path / "bag").metadata.count >= 3
 
 
+def assert_cut_off(bag, publisher, due):
+    """What is left of a killed recorder's bag: at least so many messages, in order."""
+    assert [path.name for path in bag.iterdir()] == ["bag_0.mcap"]
+    with pytest.raises(BagError, match="has no end"):
+        Bag(bag)
+    saved = salvage(bag, bag.parent / "saved")
+    assert saved.counts["/run/mesh/states"] >= due
+    assert any("has no end" in text for text in saved.missing)
+    read = recorded_states(bag.parent / "saved")
+    assert read == publisher.sent["/run/mesh/states"][: len(read)]
+
+
+def test_killed_recorder_leaves_what_was_flushed(graph, tmp_path):
+    bag = tmp_path / "bag"
+    publisher = graph.start(Publisher)
+    process = record(graph, bag)
+    due = 0
+    deadline = time.monotonic() + PATIENCE
+    for i in count():
+        publisher.send("mesh/states", messages.MeshStates(states=noise(i)))
+        time.sleep(0.01)
+        if i % 20 == 0 and (bag / "bag_0.mcap").exists():
+            due = flushed(bag)["/run/mesh/states"]
+        if due > 50:
+            break
+        assert time.monotonic() < deadline
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert_cut_off(bag, publisher, due)
+
+
+@pytest.mark.slow  # and a promise about time, which a busy machine may break
 def test_killed_recorder_loses_at_most_a_second(graph, tmp_path):
     bag = tmp_path / "bag"
     publisher = graph.start(Publisher)
@@ -252,17 +287,10 @@ def test_killed_recorder_loses_at_most_a_second(graph, tmp_path):
     process.send_signal(signal.SIGKILL)
     killed = time.monotonic()
     process.wait()
-    # Half a second until it is flushed, and half for the way there on a busy machine.
+    # Half a second until it is flushed, and half for the way there.
     due = 1 + sum(killed - sent > 1.0 for sent in times)
     assert due > 50
-    assert [path.name for path in bag.iterdir()] == ["bag_0.mcap"]
-    with pytest.raises(BagError, match="has no end"):
-        Bag(bag)
-    saved = salvage(bag, tmp_path / "saved")
-    assert saved.counts["/run/mesh/states"] >= due
-    assert any("has no end" in text for text in saved.missing)
-    read = recorded_states(tmp_path / "saved")
-    assert read == publisher.sent["/run/mesh/states"][: len(read)]
+    assert_cut_off(bag, publisher, due)
 
 
 def test_stopped_in_full_swing_the_bag_is_whole(graph, tmp_path):
@@ -297,7 +325,7 @@ def test_full_disk_ends_the_recorder_with_a_clear_error(graph, tmp_path):
     for i in range(60):
         publisher.send("mesh/states", messages.MeshStates(states=noise(i)))
         time.sleep(0.005)
-    _, log = process.communicate(timeout=20.0)
+    _, log = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert "[FATAL]" in log
     assert "Traceback" not in log
@@ -323,7 +351,7 @@ def test_on_a_full_disk_it_stops_or_goes_on_as_told(graph, tmp_path, on_error):
             publisher.send("mesh/states", messages.MeshStates(states=noise(number)))
             time.sleep(0.01)
         if on_error == "stop":
-            _, log = process.communicate(timeout=20.0)
+            _, log = process.communicate(timeout=PATIENCE)
             assert "[FATAL]" in log
         else:
             # It lives on, and hears the others to the end.
@@ -382,7 +410,7 @@ def test_bad_parameter_is_a_clear_error(graph, tmp_path, arguments, text):
     (tmp_path / "bag").mkdir()
     bag = tmp_path / ("bag" if not arguments else "new")
     process = record(graph, bag, *arguments)
-    _, log = process.communicate(timeout=20.0)
+    _, log = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2
     assert text in log
     assert "Traceback" not in log

@@ -12,7 +12,8 @@ from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MeshInfo
 from rclpy.action import ActionServer
 from rclpy.node import Node
-from ros_graph import DOMAIN, Client, ros_graph, wait_for
+from rclpy.parameter import Parameter
+from ros_graph import DOMAIN, PATIENCE, Client, ros_graph, wait_for
 from test_nodes import assert_same_mesh, grown_here, settings
 
 from biped_mfpt_ros.cli import client as cli
@@ -31,13 +32,13 @@ class Counting(Simulator):
     count = largest = 0
     hold_above = math.inf
 
-    def __init__(self, name=None):
-        super().__init__(name)
+    def __init__(self, name=None, **options):
+        super().__init__(name, **options)
         self.go_on = threading.Event()
 
     def _simulate(self, request, response):
         if self.count > self.hold_above:
-            self.go_on.wait(60.0)
+            self.go_on.wait(PATIENCE)
         self.count += len(request.previous_slopes)
         self.largest = max(self.largest, len(request.previous_slopes))
         time.sleep(0.1)  # so that a mesh outlasts what is slow to cancel it
@@ -128,7 +129,7 @@ def test_mesher_killed_again_and_again_ends_with_the_same_mesh(
         assert tester.send_goal_to(f"mesher_{kill}", goal).accepted
         wait_for(lambda more=more, a=answered: sum(s.count for s in simulators) > a + more, "work")
         mesher.send_signal(sent)
-        mesher.wait(10.0)
+        mesher.wait(PATIENCE)
         for simulator in simulators:
             simulator.release()
         assert len(journals(tmp_path)) == 1, kill
@@ -150,17 +151,24 @@ def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_
     graph, tester, goal, mesh_here, tmp_path
 ):
     simulator = graph.start(Counting)
-    graph.start(
-        Mesher, checkpoint_directory=str(tmp_path), simulator_wait_seconds=0.3,
+    mesher = graph.start(
+        Mesher, checkpoint_directory=str(tmp_path), simulator_wait_seconds=1e6,
         simulator_timeout=0.1, chunk_seconds=0.001,
     )  # fmt: skip
+
+    def wait_seconds(value):
+        (result,) = mesher.set_parameters([Parameter("simulator_wait_seconds", value=value)])
+        assert result.successful
+
     handle = tester.send_goal(goal)
     wait_for(lambda: simulator.count > 100, "work")
     graph.stop(simulator)
+    wait_seconds(0.3)
     status, result = tester.outcome(handle)
     assert status == GoalStatus.STATUS_ABORTED
     assert "no simulator answered" in result.message
     assert len(journals(tmp_path)) == 1
+    wait_seconds(1e6)
     again = graph.start(lambda: Counting("again"))
     handle = tester.send_goal(goal)
     wait_for(lambda: again.count > 20, "work")

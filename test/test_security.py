@@ -98,14 +98,20 @@ def test_policies_allow_what_the_nodes_have_and_nothing_else(tmp_path):
             everyone = {names.get(name, name) for name in (*NODES, "run")}
             wait_for(lambda: everyone <= set(run._node.get_node_names()), "all to see each other")
             for name in (*NODES, "run"):
-                policy, real = allowed(name), had(run._node, names.get(name, name))
-                for kind in KINDS:
-                    unmet = set(policy[kind])
-                    for topic in real[kind]:
-                        matching = {p for p in policy[kind] if fnmatchcase(topic, p)}
-                        assert matching, f"{name} may not {kind} {topic}"
-                        unmet -= matching
-                    assert not unmet, f"{name} need not {kind} {unmet}"
+                policy = allowed(name)
+
+                def unmet(name=name, policy=policy):
+                    real = had(run._node, names.get(name, name))
+                    left = {(kind, p) for kind in KINDS for p in policy[kind]}
+                    for kind in KINDS:
+                        for topic in real[kind]:
+                            matching = {(kind, p) for p in policy[kind] if fnmatchcase(topic, p)}
+                            assert matching, f"{name} may not {kind} {topic}"
+                            left -= matching
+                    return left
+
+                # A node is seen before all that it has is.
+                wait_for(lambda unmet=unmet: not unmet(), f"{name} to need all that it may")
         finally:
             run.leave()
     assert {f"/{topic}" for topic in recorder.TOPICS} <= allowed("recorder")["subscribe"]
@@ -128,7 +134,7 @@ def test_every_node_refuses_to_start_without_the_security_asked_for(tmp_path, na
         package = str(Path(__file__).parents[1])
         done = subprocess.run(
             command, env=os.environ | asked | {"PYTHONPATH": package}, cwd=tmp_path,
-            capture_output=True, text=True, timeout=120.0,
+            capture_output=True, text=True, timeout=600.0,
         )  # fmt: skip
         assert done.returncode == 2
         assert said in done.stderr

@@ -13,7 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-_GRACE = 2.0  # s from SIGTERM to SIGKILL, for each of two groups: together less than 5 s
+_GRACE = 2.0  # s from SIGTERM to SIGKILL
+_LAST_GRACE = 4.5  # s, for the last ones, from when the first were asked: together less than 5 s
 _POLL = 0.02  # s
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -63,7 +64,8 @@ class Processes:
     must be; once one came, the block ends with `Stopped` and nothing else. Each child has a session
     of its own, so that Ctrl-C on the terminal reaches this process alone and children are stopped
     in order: SIGTERM to all but the last ones, SIGKILL to those that are left after 2 s, then the
-    same for the last ones. A second signal meanwhile kills what is left at once.
+    same for the last ones, which have until 4.5 s. A second signal meanwhile kills what is left at
+    once.
 
     Parameters
     ----------
@@ -130,13 +132,12 @@ class Processes:
     def stop(self) -> None:
         """Stop all children, in at most 5 s."""
         with self._held():
-            signals = self._signals
-            for last in (False, True):
+            signals, start = self._signals, time.monotonic()
+            for last, grace in ((False, _GRACE), (True, _LAST_GRACE)):
                 group = [child for child in self.running() if child.last == last]
                 for child in group:
                     _signal(child, signal.SIGTERM)
-                deadline = time.monotonic() + _GRACE
-                while self._signals == signals and time.monotonic() < deadline:
+                while self._signals == signals and time.monotonic() < start + grace:
                     if all(child.process.poll() is not None for child in group):
                         break
                     time.sleep(_POLL)

@@ -8,6 +8,7 @@ import socket
 import traceback
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from biped_mfpt_msgs.srv import SimulateSteps
@@ -62,8 +63,8 @@ class Simulator(Node):
     `FairService`.
     """
 
-    def __init__(self, name: str | None = None) -> None:
-        super().__init__(name or default_name())
+    def __init__(self, name: str | None = None, **options: Any) -> None:
+        super().__init__(name or default_name(), **options)
         self._declared = Declared(self, SimulatorParameters)
         # Only then is the service there to be found: who sees a simulator can use it.
         with compiled(self.get_logger().info, "the step map"):
