@@ -448,6 +448,24 @@ class TestProcesses:
         assert child.process.returncode == -signal.SIGKILL
         assert child.ending() == "was killed by SIGKILL"
 
+    def test_the_last_one_has_longer(self, tmp_path, monkeypatch):
+        """A recorder that closes its bag on a busy machine."""
+        monkeypatch.setattr("biped_mfpt_ros.cli.processes._GRACE", 0.1)
+        monkeypatch.setattr("biped_mfpt_ros.cli.processes._LAST_GRACE", PATIENCE)
+        slow = (
+            "import signal, sys, time\n"
+            "def end(*_):\n"
+            "    time.sleep(0.5)\n"
+            "    sys.exit(0)\n"
+            "signal.signal(signal.SIGTERM, end)\n"
+            "print('up', flush=True)\n"
+            "time.sleep(600)\n"
+        )
+        with Processes(tmp_path) as processes:
+            last = processes.start("slow", [sys.executable, "-c", slow], last=True)
+            wait_until_up(last)
+        assert last.ending() == "ended with code 0"
+
     def test_early_end_is_reported_once_with_the_log(self, tmp_path):
         with Processes(tmp_path) as processes:
             command = [sys.executable, "-c", "print('last words'); raise SystemExit(3)"]

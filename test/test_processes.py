@@ -126,7 +126,7 @@ def test_pipeline_of_processes(graph, client):
 
     # A mesh that is being grown does not keep anyone from stopping cleanly.
     seen = []
-    handle = client.send_goal(settings("hzd/mfpt", 0.001), seen.append)
+    handle = client.send_goal(settings("hzd/mfpt", 1e-5), seen.append)
     wait_for(lambda: seen and seen[-1].swings > 100, "the mesh to grow")
     running = [*others, *(process for process in started if process is not victim)]
     for number, process in zip((signal.SIGTERM, signal.SIGINT) * 3, running, strict=False):
