@@ -15,7 +15,9 @@ from biped_mfpt_ros.bench.pipeline import grow_here, settings_of
 
 def run(short: bool) -> Section:
     """Grow it with as many simulators as there are cores, an analysis and a recorder."""
-    settings = dataclasses.replace(settings_of(0.02 if short else 1.6e-4), max_states=1_000_000)
+    settings = dataclasses.replace(
+        settings_of("hzd/mfpt", 0.02 if short else 1.6e-4), max_states=1_000_000
+    )
     mesh, step_map, beside = grow_here(settings)
     n = len(mesh.states)
     with Nodes() as nodes:

@@ -24,14 +24,14 @@ from biped_mfpt_ros.nodes.spin import keep_freed_memory
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
 
-CONTROLLER = controller("hzd/mfpt")
 IN_FLIGHT = (1, 2, 4, 8)
 
 
-def settings_of(threshold: float) -> MeshSettings:
+def settings_of(name: str, threshold: float) -> MeshSettings:
     """The mesh that is grown."""
-    state = find_limit_cycle(CONTROLLER).state
-    return MeshSettings(CONTROLLER, WalkerModel(), SLOPES, threshold, initial_state=state)
+    walking = controller(name)
+    state = find_limit_cycle(walking).state
+    return MeshSettings(walking, WalkerModel(), SLOPES, threshold, initial_state=state)
 
 
 def grow_here(settings: MeshSettings) -> tuple[Mesh, float, float]:
@@ -41,7 +41,7 @@ def grow_here(settings: MeshSettings) -> tuple[Mesh, float, float]:
     def simulate(states: np.ndarray, previous: np.ndarray) -> Steps:
         nonlocal inside
         start = time.process_time()
-        steps = simulate_steps(CONTROLLER, states, previous, SLOPES, measures=False)
+        steps = simulate_steps(settings.controller, states, previous, SLOPES, measures=False)
         inside += time.process_time() - start
         return steps
 
@@ -59,7 +59,7 @@ def grow_here(settings: MeshSettings) -> tuple[Mesh, float, float]:
 
 def small(nodes: Nodes, processes: dict[str, list[Any]], short: bool) -> Section:
     """Meshes of the paper's HZD setting, several at a time: what an optimiser asks for."""
-    settings = settings_of(0.3)
+    settings = settings_of("hzd/mfpt", 0.3)
     mesh, step_map, beside = min((grow_here(settings) for _ in range(5)), key=lambda m: m[1])
     section = Section()
     total = 16 if short else 60
@@ -100,8 +100,8 @@ def requests_of(nodes: Nodes) -> int:
     return int(found[-1])
 
 
-def large(nodes: Nodes, processes: dict[str, list[Any]], short: bool) -> Section:
-    """A mesh of some 1e4 states with one simulator and with two.
+class Large:
+    """A mesh of some 1e4 states with one simulator, and later with two.
 
     What the pipeline costs is that of one simulator, without what the step map, tests and targets
     take in this process just before each mesh. The floor is what as many calls of as many bytes
@@ -111,58 +111,70 @@ def large(nodes: Nodes, processes: dict[str, list[Any]], short: bool) -> Section
     one: at best they share all that there is to compute, and that is the bound beside the
     efficiency.
     """
-    settings = settings_of(0.02 if short else 0.0005)
-    repetitions = 2 if short else 9
-    mesh, _, _ = grow_here(settings)
-    n = len(mesh.states) - 1
-    successes = np.count_nonzero(mesh.outcomes[1:] == Outcome.STEP)
-    nodes.grow(settings)
-    requests = requests_of(nodes)
-    section = Section()
-    walls = {}
-    # Step map, tests and targets, mesher, simulator, floor.
-    times = np.empty((repetitions, 5))
-    seconds = np.empty(repetitions)
-    with Nodes() as others:
-        bare = Bare(others, round(n / requests), len(SLOPES), round(successes / requests))
-        bare.call(requests)
-        for i in range(repetitions):
-            times[i, :2] = grow_here(settings)[1:]
-            seconds[i], *times[i, 2:4] = one(nodes, processes, settings, n)
-            times[i, 4] = bare.call(requests)
-    for simulators in (1, 2):
-        if simulators == 2:
-            processes["simulator"].append(nodes.start("simulator", "simulator_2"))
-            nodes.wait(2)
-            time.sleep(1.0)  # for the mesher to find it
-            seconds = np.array([one(nodes, processes, settings, n)[0] for _ in range(repetitions)])
-        walls[simulators] = seconds.min()
-        what = f"mesh of {n + 1} states, {simulators} simulator(s)"
-        section.rows.append(row(what, seconds, 1, "s"))
-    names = ("step map", "tests and targets", "mesher", "simulator", "floor of rclpy")
-    for name, values in zip(names, times.T, strict=True):
-        section.rows.append(row(f"CPU a state, mesh of {n + 1}: {name}", values, n, "us"))
-    # Differences of times, so a little below 0 now and then.
-    step_map, beside = np.median(times[:, :2], axis=0)
-    mesher, simulator = np.median(times[:, 2:4] - times[:, [1, 0]], axis=0)
-    floor = np.median(times[:, 4])
-    section.facts.update(
-        {
-            f"us of CPU a state, mesh of {n + 1}: mesher, all else": round(1e6 * mesher / n, 2),
-            f"us of CPU a state, mesh of {n + 1}: simulator, all else": round(
-                1e6 * simulator / n, 2
-            ),
-            f"requests, mesh of {n + 1}": requests,
-            f"bytes of answers a state, mesh of {n + 1}": round(len(SLOPES) + 80 * successes / n),
+
+    def __init__(self, name: str, threshold: float, repetitions: int) -> None:
+        self._name = name
+        self._settings = settings_of(name, threshold)
+        self._repetitions = repetitions
+        mesh, _, _ = grow_here(self._settings)
+        self._n = len(mesh.states) - 1
+        self._successes = int(np.count_nonzero(mesh.outcomes[1:] == Outcome.STEP))
+        self.section = Section()
+
+    def _row(self, simulators: int, seconds: np.ndarray) -> None:
+        what = f"{self._name}, mesh of {self._n + 1} states, {simulators} simulator(s)"
+        self.section.rows.append(row(what, seconds, 1, "s"))
+
+    def with_one(self, nodes: Nodes, processes: dict[str, list[Any]]) -> None:
+        """Grow it with the one simulator that there is."""
+        n, settings = self._n, self._settings
+        nodes.grow(settings)
+        requests = requests_of(nodes)
+        # Step map, tests and targets, mesher, simulator, floor.
+        times = np.empty((self._repetitions, 5))
+        seconds = np.empty(self._repetitions)
+        with Nodes() as others:
+            bare = Bare(others, round(n / requests), len(SLOPES), round(self._successes / requests))
+            bare.call(requests)
+            for i in range(self._repetitions):
+                times[i, :2] = grow_here(settings)[1:]
+                seconds[i], *times[i, 2:4] = one(nodes, processes, settings, n)
+                times[i, 4] = bare.call(requests)
+        self._row(1, seconds)
+        self._alone = seconds.min()
+        what = f"{self._name}, mesh of {n + 1}"
+        names = ("step map", "tests and targets", "mesher", "simulator", "floor of rclpy")
+        for name, values in zip(names, times.T, strict=True):
+            self.section.rows.append(row(f"CPU a state, {what}: {name}", values, n, "us"))
+        # Differences of times, so a little below 0 now and then.
+        step_map, beside = np.median(times[:, :2], axis=0)
+        mesher, simulator = np.median(times[:, 2:4] - times[:, [1, 0]], axis=0)
+        floor = np.median(times[:, 4])
+        us = f"us of CPU a state, {what}"
+        self.section.facts.update(
+            {
+                f"{us}: mesher, all else": round(1e6 * mesher / n, 2),
+                f"{us}: simulator, all else": round(1e6 * simulator / n, 2),
+                f"requests, {what}": requests,
+                f"bytes of answers a state, {what}": round(len(SLOPES) + 80 * self._successes / n),
+            }
+        )
+        bound = self._alone / (step_map + beside + mesher + simulator)
+        ratios = {
+            "bound_on_efficiency_on_2_cores": min(1.0, bound),
+            "pipeline_over_step_map": (mesher + simulator) / step_map,
+            "floor_of_rclpy_over_step_map": floor / step_map,
+            "pipeline_without_floor_over_step_map": (mesher + simulator - floor) / step_map,
         }
-    )
-    all_work = step_map + beside + mesher + simulator
-    section.ratios["efficiency_of_2_simulators"] = walls[1] / (2.0 * walls[2])
-    section.ratios["its_bound_on_2_cores"] = min(1.0, walls[1] / all_work)
-    section.ratios["pipeline_over_step_map"] = (mesher + simulator) / step_map
-    section.ratios["floor_of_rclpy_over_step_map"] = floor / step_map
-    section.ratios["pipeline_without_floor_over_step_map"] = (mesher + simulator - floor) / step_map
-    return section
+        self.section.ratios.update({f"{k}: {self._name}": v for k, v in ratios.items()})
+
+    def with_two(self, nodes: Nodes, processes: dict[str, list[Any]]) -> None:
+        """Grow it again, with two."""
+        tries = range(self._repetitions)
+        seconds = np.array([one(nodes, processes, self._settings, self._n)[0] for _ in tries])
+        self._row(2, seconds)
+        efficiency = self._alone / (2.0 * seconds.min())
+        self.section.ratios[f"efficiency_of_2_simulators: {self._name}"] = efficiency
 
 
 def one(
@@ -188,7 +200,18 @@ def run(short: bool) -> Section:
         }
         nodes.wait(1)
         time.sleep(1.0)
-        parts = [large(nodes, processes, short), small(nodes, processes, short)]
+        meshes = [Large("hzd/mfpt", 0.02, 2)] if short else [
+            Large("hzd/mfpt", 0.0005, 9),
+            Large("smc/mfpt", 0.07, 3),
+        ]  # fmt: skip
+        for mesh in meshes:
+            mesh.with_one(nodes, processes)
+        processes["simulator"].append(nodes.start("simulator", "simulator_2"))
+        nodes.wait(2)
+        time.sleep(1.0)  # for the mesher to find it
+        for mesh in meshes:
+            mesh.with_two(nodes, processes)
+        parts = [*(mesh.section for mesh in meshes), small(nodes, processes, short)]
     for part in parts:
         section.rows.extend(part.rows)
         section.ratios.update(part.ratios)

@@ -16,7 +16,7 @@ import numpy as np
 
 from biped_mfpt_ros.bench.measure import SLOPES, BenchError, Section
 from biped_mfpt_ros.bench.nodes import Nodes, cpu_seconds
-from biped_mfpt_ros.bench.pipeline import CONTROLLER, settings_of
+from biped_mfpt_ros.bench.pipeline import settings_of
 from biped_mfpt_ros.chain.mesh import grow_mesh
 from biped_mfpt_ros.gait.step import Steps, simulate_steps
 from biped_mfpt_ros.nodes.messages import MeshSettings
@@ -32,7 +32,7 @@ def recorded(settings: MeshSettings, path: Path) -> tuple[int, float]:
     def simulate(states: np.ndarray, previous: np.ndarray) -> Steps:
         nonlocal inside
         start = time.thread_time()
-        steps = simulate_steps(CONTROLLER, states, previous, SLOPES, measures=False)
+        steps = simulate_steps(settings.controller, states, previous, SLOPES, measures=False)
         inside += time.thread_time() - start
         kept.append((states, steps))
         return steps
@@ -82,7 +82,7 @@ def with_simulators(
 def run(short: bool) -> Section:
     """Grow one mesh with more and more simulators."""
     section = Section()
-    settings = settings_of(0.02 if short else 0.002)
+    settings = settings_of("hzd/mfpt", 0.02 if short else 0.002)
     with Nodes() as nodes:
         path = nodes.directory / "answers.npz"
         states, swing = recorded(settings, path)
