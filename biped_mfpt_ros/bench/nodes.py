@@ -18,13 +18,16 @@ import rclpy
 from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MeshInfo, MeshStates, MeshTransitions
 from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from unique_identifier_msgs.msg import UUID
 
 from biped_mfpt_ros.chain.mesh import Mesh
+from biped_mfpt_ros.nodes.answers import Answer
 from biped_mfpt_ros.nodes.assembly import MeshAssembly
 from biped_mfpt_ros.nodes.messages import MeshSettings, settings_message
 from biped_mfpt_ros.nodes.qos import RESULTS
@@ -142,6 +145,12 @@ class Nodes:
             timeout,
             "the nodes to come up",
         )
+        # A goal may be lost until the mesher has found this client, and then it answers: here, that
+        # it has no such goal to cancel.
+        none = ClientGoalHandle(
+            self._grow, UUID(uuid=[1] * 16), GrowMesh.Impl.SendGoalService.Response()
+        )
+        self.spin(Answer(none.cancel_goal_async).done, timeout, "an answer of the mesher")
 
     def spin_once(self, timeout: float) -> None:
         """Take what comes within a time, s."""
