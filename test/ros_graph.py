@@ -28,7 +28,7 @@ from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 DOMAIN = 1 + os.getpid() % 100
 
 
-PATIENCE = 300.0
+PATIENCE = 600.0
 """s, for what has to happen: nodes may have to compile first, several of them on a busy machine."""
 
 

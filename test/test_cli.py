@@ -380,12 +380,12 @@ def test_json_text():
 
 
 # A child that ends on SIGTERM, one that does not, and a program that starts one and waits.
-SLEEP = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(600)"]
+SLEEP = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(3600)"]
 STUBBORN = [
     sys.executable,
     "-c",
     "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
-    "print('up', flush=True); time.sleep(600)",
+    "print('up', flush=True); time.sleep(3600)",
 ]
 
 
@@ -428,7 +428,7 @@ class TestProcesses:
             "    sys.exit(0)\n"
             "signal.signal(signal.SIGTERM, end)\n"
             "print('up', flush=True)\n"
-            "time.sleep(600)\n"
+            "time.sleep(3600)\n"
         )
         order = tmp_path / "order"
         with Processes(tmp_path / "logs") as processes:
@@ -459,7 +459,7 @@ class TestProcesses:
             "    sys.exit(0)\n"
             "signal.signal(signal.SIGTERM, end)\n"
             "print('up', flush=True)\n"
-            "time.sleep(600)\n"
+            "time.sleep(3600)\n"
         )
         with Processes(tmp_path) as processes:
             last = processes.start("slow", [sys.executable, "-c", slow], last=True)
@@ -504,7 +504,7 @@ class TestProcesses:
             "import os, signal, time\n"
             f"signal.signal(signal.SIGTERM, lambda *_: os.kill({os.getpid()}, signal.SIGINT))\n"
             "print('up', flush=True)\n"
-            "while True: time.sleep(600)\n"
+            "while True: time.sleep(3600)\n"
         )
         processes = Processes(tmp_path)
 
@@ -527,7 +527,7 @@ class TestProcesses:
             "from biped_mfpt_ros.cli.node import end_with\n"
             "end_with(int(sys.argv[1]))\n"
             "print('up', flush=True)\n"
-            "time.sleep(600)\n"
+            "time.sleep(3600)\n"
         )
         parent = (
             "import os, pathlib, sys, time\n"
@@ -537,7 +537,7 @@ class TestProcesses:
             "    child = processes.start('child', command)\n"
             "    while 'up' not in child.log.read_text(): time.sleep(0.01)\n"
             "    print(child.process.pid, flush=True)\n"
-            "    time.sleep(600)\n"
+            "    time.sleep(3600)\n"
         )
         command = [sys.executable, "-c", parent, str(tmp_path)]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as process:

@@ -26,7 +26,7 @@ def test_a_run_on_a_full_disk_stops_or_goes_on_as_told(tmp_path, on_error):
             disk, "--threshold", "0.02", "--workers", "1", "--walks", "0", "--json",
             "--output", "run", "--on-record-error", on_error,
         )  # fmt: skip
-        code, out, err = run.end(300.0)
+        code, out, err = run.end()
         assert run.nodes() == {}
         assert not (disk / "run" / "bag" / "metadata.yaml").exists()
         assert code == 1
@@ -73,7 +73,7 @@ def is_alone_again(run):
 def test_a_signal_in_any_phase_ends_everything_within_5_s(tmp_path, phase, number):
     arguments, reached = PHASES[phase]
     run = Run(tmp_path, *arguments)
-    wait_until(lambda: reached(run), run, phase, 300.0)
+    wait_until(lambda: reached(run), run, phase)
     start = time.monotonic()
     run.process.send_signal(number)
     # All of its nodes, also where it was killed and could not stop them.

@@ -21,7 +21,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # it may have been ign
 from biped_mfpt_ros.cli.workers import workers
 with workers(2) as pool:
     print(*{f.result() for f in [pool.submit(os.getpid)] * 2}, flush=True)
-    pool.submit(time.sleep, 1200).result()
+    pool.submit(time.sleep, 3600).result()
 """
 
 
