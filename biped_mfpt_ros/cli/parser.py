@@ -251,7 +251,7 @@ at the same time share the work. The trials depend on the settings and the seed 
 many workers score them. `biped-mfpt study` lists, shows, plots and exports studies.
 
 examples:
-  biped-mfpt optimise --controller hzd/mfpt --sigma 1 --trials 1000
+  biped-mfpt optimise --controller hzd/mfpt --sigma 1 --trials 4000
   biped-mfpt optimise --controller smc/base --sigma 2 --searcher pattern --fix 'k*' \\
       --seconds 3600 --slip-duration 0.008 --torque-limit 45 --mesh 1:1 1:0.3:-0.02
   biped-mfpt optimise --controller hzd/robust --as-spline --sigma 5 --slope-limit 45
