@@ -11,7 +11,7 @@ import pytest
 from cmaes import CMA
 from scipy.optimize import minimize
 
-from biped_mfpt_ros.cli.study import run_rows
+from biped_mfpt_ros.cli.study import run_rows, summary_text
 from biped_mfpt_ros.control import hzd
 from biped_mfpt_ros.control.controller import catalogue, controller
 from biped_mfpt_ros.errors import InputError
@@ -216,7 +216,8 @@ class Scored:
         score = -float(np.square(parameters - 0.5 * settings.start.parameters).sum())
         # What is confirmed depends on the best before: so must be equal however it is run.
         stage = "confirmed" if score > best.score else "mesh 1"
-        return Evaluation(stage, score, (-score,), 0.0, {"mfpt": score})
+        values = {"mfpt": score, "cot": 0.1, "speed": 1.0}
+        return Evaluation(stage, score, (-score,), 0.0, values)
 
 
 SETTINGS = StudySettings(controller("smc/base"), seed=5)
@@ -289,6 +290,10 @@ def test_runs_are_told_from_the_store_and_the_best_is_that_of_all(scored, tmp_pa
     assert len({*runs[433:]}) == 1
     confirmed = [t for t in trials if t.found.confirmed]
     assert best_trial(trials).found.score == max(t.found.score for t in confirmed)
+    assert study.runs_left() == [runs[-1]]
+    text = summary_text(study, trials)
+    assert text.count(", ended\n") == 3
+    assert "it takes more" not in text
     rows = run_rows(study, trials)
     assert [row["trials"] for row in rows] == [runs.count(k) for k in (1, 2, 3, 4)]
     for row in rows:

@@ -61,7 +61,8 @@ def test_result_is_told(finished, capsys):
     assert optimise(finished, "--trials", "20") == 0
     text = capsys.readouterr().out
     assert "study s: 20 trials" in text
-    assert f"run 1: 8 trials, best score {result['runs'][0]['score']:.3g}" in text
+    assert f"run 1: 8 trials, best score {result['runs'][0]['score']:.3g}\n" in text
+    assert "4 runs share the trials until one is left" in text
     assert "outside of the step map" in text
 
 

@@ -73,11 +73,12 @@ def optimise(args: argparse.Namespace) -> None:
     }
     best = best_trial(trials)
     result["best"] = None if best is None else trial_row(study, best)
+    text = summary_text(study, trials)
     store.close()
     if args.json:
         print(json_text(result))
         return
-    print(summary_text(study, trials))
+    print(text)
     print(
         f"\n{tally.done} trials in {duration_text(tally.seconds)}, "
         f"{rate_text(result['trials_per_second'])} a second; "

@@ -169,8 +169,15 @@ def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
         stages[t.found.stage] = stages.get(t.found.stage, 0) + 1
     counts = ", ".join(f"{count} {stage}" for stage, count in sorted(stages.items()))
     lines = [f"study {study.name}: {len(done)} trials ({counts})"]
-    for row in run_rows(study, trials):
-        lines.append(f"run {row['run']}: {row['trials']} trials, best score {score_text(row)}")
+    if rows := run_rows(study, trials):
+        left = study.runs_left()
+        for row in rows:
+            ended = "" if row["run"] in left else ", ended"
+            lines.append(
+                f"run {row['run']}: {row['trials']} trials, best score {score_text(row)}{ended}"
+            )
+        if len(left) > 1:
+            lines.append(f"{len(left)} runs share the trials until one is left: it takes more")
     confirmed = sorted(
         (t for t in done if t.found is not None and t.found.confirmed),
         key=lambda t: (-t.found.score, t.number),  # type: ignore[union-attr]

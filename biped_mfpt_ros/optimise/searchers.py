@@ -60,6 +60,11 @@ class Searcher(ABC):
         How many costs are told.
     candidates : sequence of sequence of float
         What `Given` has tried, shape (k, n).
+
+    Attributes
+    ----------
+    runs_left : list of int
+        Runs that have not ended.
     """
 
     done = False
@@ -80,6 +85,7 @@ class Searcher(ABC):
         self.bounds = np.asarray(bounds, dtype=np.float64)
         self.n = len(self.bounds)
         self.seed, self.step, self.population, self.runs = seed, step, population, runs
+        self.runs_left = list(range(1, runs + 1))
         self.objectives = objectives
         self.candidates = candidates
         self._started = False
@@ -145,6 +151,7 @@ class CmaEs(Searcher):
             best = sorted(self._left, key=lambda run: -run.best_score)
             best = best[: (len(best) + 1) // 2]
             self._left = [run for run in self._left if run in best]
+            self.runs_left = [run.number for run in self._left]
         self.run = self._left[self._turn % len(self._left)].number
 
 

@@ -108,6 +108,12 @@ class Study:
                 self._catch_up()
             return self._runs[generation]
 
+    def runs_left(self) -> list[int]:
+        """Runs of the search that have not ended."""
+        with self._lock:
+            self._catch_up()
+            return self._searcher.runs_left
+
     def run(
         self,
         backend: Backend,
