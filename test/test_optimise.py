@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -369,6 +371,32 @@ def test_stop_and_deadline_end_a_study(scored, tmp_path):
     reason, _ = run(tmp_path / "s.sqlite", trials=None, seconds=0.2)
     assert reason == "seconds"
     assert time.monotonic() - begun < 300.0
+
+
+def test_a_signal_stops_a_study_whichever_thread_it_comes_to(scored, tmp_path, monkeypatch):
+    """The main thread that waits is not always woken by it."""
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    def in_a_worker(*args):
+        if not scored.calls:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR1})
+            os.kill(os.getpid(), signal.SIGUSR1)
+        return scored(*args)
+
+    monkeypatch.setattr(study_module, "evaluate", in_a_worker)
+    scored.seconds = 0.01
+    scored.at_most = 1000  # it would have no end
+    handler = signal.signal(signal.SIGUSR1, interrupt)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "s.sqlite", trials=None)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR1})
+        signal.signal(signal.SIGUSR1, handler)
+    assert len(scored.calls) < 1000
 
 
 def confirmed(cot, mfpt, stage="confirmed"):

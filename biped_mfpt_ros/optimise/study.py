@@ -12,7 +12,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from typing import Any
 
@@ -196,7 +196,12 @@ class Study:
         try:
             with ThreadPoolExecutor(workers, "trial") as pool:
                 try:
-                    for job in [pool.submit(work) for _ in range(workers)]:
+                    jobs = [pool.submit(work) for _ in range(workers)]
+                    # A signal that comes just before a wait, or to another thread, does not end it,
+                    # and its handler has to wait, too: without a timeout, for the whole study.
+                    while wait(jobs, _LOOK).not_done:
+                        pass
+                    for job in jobs:
                         job.result()
                 except BaseException:
                     stop.set()
