@@ -37,7 +37,7 @@ def test_another_swing_for_scipy_is_an_error(monkeypatch):
     assert durations.min() < 0.1 < 0.6 < durations.max()  # early falls, and last impacts
     monkeypatch.setattr(step_map, "swings_of", lambda name: (*swings, durations + 1e-3))
     with pytest.raises(BenchError, match="hzd/base: scipy ends"):
-        step_map.scipy_swings("hzd/base", 1)
+        step_map.scipy_swings("hzd/base", 1, False)
 
 
 def test_chains_of_the_benchmark_settle_and_are_exact():

@@ -67,8 +67,13 @@ def _padded(steps: Steps) -> np.ndarray:
     return out
 
 
-def step_map(name: str, repetitions: int) -> tuple[list[dict[str, Any]], dict[str, Any], float]:
-    """One swing for all 81 slopes, with a check against a tolerance of 1e-12."""
+def step_map(
+    name: str, repetitions: int
+) -> tuple[list[dict[str, Any]], dict[str, Any], dict[bool, float]]:
+    """One swing for all 81 slopes, with a check against a tolerance of 1e-12.
+
+    Rows, facts, and seconds without and with measures.
+    """
     control, model = controller(name), readings()[name].model
     _, states, previous = reached(control, model)
     # About as many as in a request of a large mesh: lanes are idle only as a batch ends.
@@ -102,7 +107,11 @@ def step_map(name: str, repetitions: int) -> tuple[list[dict[str, Any]], dict[st
         f"{name}: steps of the integrator a swing": found.integrator_steps / n,
         f"{name}: impacts a swing": float((found.outcomes == Outcome.STEP).sum() / n),
     }
-    return rows, facts, float(np.median(seconds)) / n
+    return (
+        rows,
+        facts,
+        {k: float(np.median(s)) / n for k, s in ((False, seconds), (True, measured))},
+    )
 
 
 def cycle_of(name: str) -> tuple[Controller, WalkerModel, np.ndarray]:
@@ -147,10 +156,11 @@ def _derivative(scheme, rob, par, w, y, rate, torques):
     closed_loop(scheme, switched, rob, par, w, y, rate, torques)
 
 
-def scipy_swings(name: str, repetitions: int) -> tuple[np.ndarray, int, float]:
+def scipy_swings(name: str, repetitions: int, energy: bool) -> tuple[np.ndarray, int, float]:
     """Seconds of scipy's RK45 at rtol 1e-6 for the swings timed, on the same compiled right side.
 
-    Also how many swings these are, and the greatest error at their ends, rad or rad/s.
+    Also how many swings these are, and the greatest error at their ends, rad or rad/s. With the
+    energy it has kinks to step over, wherever a joint's power changes its sign.
     """
     control, model, starts, ends, durations = swings_of(name)
     rob, par = model.packed(), control.packed(model.robot)
@@ -158,11 +168,14 @@ def scipy_swings(name: str, repetitions: int) -> tuple[np.ndarray, int, float]:
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         _derivative(control.code, rob, par, work, y, rate, torques)
-        return rate[:10].copy()
+        return rate[:columns].copy()
+
+    columns = 11 if energy else 10
+    starts = np.column_stack([starts, np.zeros(len(starts))])[:, :columns]  # none spent yet
 
     def integrate() -> list[np.ndarray]:
         return [
-            solve_ivp(derivative, (0.0, duration), start, rtol=1e-6, atol=1e-9).y[:, -1]
+            solve_ivp(derivative, (0.0, duration), start, rtol=1e-6, atol=1e-9).y[:10, -1]
             for start, duration in zip(starts, durations, strict=True)
         ]
 
@@ -315,21 +328,22 @@ def run(short: bool) -> Section:
     section.facts.update(facts)
     for label in ("base", "cot", "mfpt"):
         name = f"hzd/{label}"
-        seconds, n, error = scipy_swings(name, repetitions)
-        section.rows.append(row(f"{name}: swing by scipy RK45, rtol 1e-6", seconds, n, "us"))
-        section.facts[f"{name}: error of scipy RK45"] = error
-        ratio = float(np.median(seconds)) / n / medians[name]
-        section.ratios[f"scipy_over_step_map: {name}"] = ratio
+        for energy, what in ((False, name), (True, f"{name}, energies")):
+            seconds, n, error = scipy_swings(name, repetitions, energy)
+            section.rows.append(row(f"{what}: swing by scipy RK45, rtol 1e-6", seconds, n, "us"))
+            section.facts[f"{what}: error of scipy RK45"] = error
+            ratio = float(np.median(seconds)) / n / medians[name][energy]
+            section.ratios[f"scipy_over_step_map: {what}"] = ratio
         if rigid_body.mujoco is None:
             section.facts["MuJoCo"] = "not installed: pip install -r requirements/bench.txt"
         else:
             errors = rigid_body_error(name)
             seconds, n = rigid_body_swings(name, repetitions)
             section.rows.append(row(f"{name}: swing by MuJoCo, 1 ms", seconds, n, "us"))
-            ratio = float(np.median(seconds)) / n / medians[name]
+            ratio = float(np.median(seconds)) / n / medians[name][False]
             section.ratios[f"rigid_body_engine_over_step_map: {name}"] = ratio
             section.facts[f"{name}: error of MuJoCo at 1, 1/2, 1/4 ms"] = errors
-        ratio = medians[f"smc/{label}"] / medians[name]
+        ratio = medians[f"smc/{label}"][False] / medians[name][False]
         section.ratios[f"smc_over_hzd: {label}"] = ratio
         stiff = {}
         for scheme in ("hzd", "smc"):
