@@ -365,8 +365,9 @@ examples:
         type=_whole,
         default=0,
         metavar="N",
-        help="runs of cma-es from the same start, each with random numbers of its own; they "
-        "take turns, the worse half ends again and again (default: 4; below 3000 trials 1 is better)",
+        help="runs of cma-es from the same start, each with random numbers of its own; they take "
+        "turns, and the worse half ends again and again (default: 4; 1 is better for less than "
+        "3000 trials)",
     )
     optimise.add_argument(
         "--trials", type=_whole, metavar="N", help="stop when the study has N trials"
