@@ -72,7 +72,7 @@ def step_map(
 ) -> tuple[list[dict[str, Any]], dict[str, Any], dict[bool, float]]:
     """One swing for all 81 slopes, with a check against a tolerance of 1e-12.
 
-    Rows, facts, and seconds without and with measures.
+    Returns rows, facts, and the median seconds of a swing, without and with measures.
     """
     control, model = controller(name), readings()[name].model
     _, states, previous = reached(control, model)
@@ -107,11 +107,8 @@ def step_map(
         f"{name}: steps of the integrator a swing": found.integrator_steps / n,
         f"{name}: impacts a swing": float((found.outcomes == Outcome.STEP).sum() / n),
     }
-    return (
-        rows,
-        facts,
-        {k: float(np.median(s)) / n for k, s in ((False, seconds), (True, measured))},
-    )
+    medians = {False: float(np.median(seconds)) / n, True: float(np.median(measured)) / n}
+    return rows, facts, medians
 
 
 def cycle_of(name: str) -> tuple[Controller, WalkerModel, np.ndarray]:
@@ -156,13 +153,10 @@ def _derivative(scheme, rob, par, w, y, rate, torques):
     closed_loop(scheme, switched, rob, par, w, y, rate, torques)
 
 
-def scipy_swings(name: str, repetitions: int, energy: bool) -> tuple[np.ndarray, int, float]:
-    """Seconds of scipy's RK45 at rtol 1e-6 for the swings timed, on the same compiled right side.
-
-    Also how many swings these are, and the greatest error at their ends, rad or rad/s. With the
-    energy it has kinks to step over, wherever a joint's power changes its sign.
-    """
-    control, model, starts, ends, durations = swings_of(name)
+def _right_side(
+    control: Controller, model: WalkerModel, columns: int
+) -> Callable[[float, np.ndarray], np.ndarray]:
+    """The compiled right-hand side as scipy calls it: 10 columns, or 11 with the energy (J)."""
     rob, par = model.packed(), control.packed(model.robot)
     work, rate, torques = empty_scratch(), np.empty(11), np.empty(4)
 
@@ -170,7 +164,18 @@ def scipy_swings(name: str, repetitions: int, energy: bool) -> tuple[np.ndarray,
         _derivative(control.code, rob, par, work, y, rate, torques)
         return rate[:columns].copy()
 
+    return derivative
+
+
+def scipy_swings(name: str, repetitions: int, energy: bool) -> tuple[np.ndarray, int, float]:
+    """Seconds of scipy's RK45 at rtol 1e-6 for the swings timed, on the same compiled right side.
+
+    Also how many swings these are, and the greatest error at their ends, rad or rad/s. With the
+    energy it has kinks to step over, wherever a joint's power changes its sign.
+    """
+    control, model, starts, ends, durations = swings_of(name)
     columns = 11 if energy else 10
+    derivative = _right_side(control, model, columns)
     starts = np.column_stack([starts, np.zeros(len(starts))])[:, :columns]  # none spent yet
 
     def integrate() -> list[np.ndarray]:
@@ -193,13 +198,7 @@ def stiff_evaluations(name: str) -> tuple[float, float]:
     tells how much harder one control law is than another, whoever integrates it.
     """
     control, model, starts, ends, durations = swings_of(name)
-    rob, par = model.packed(), control.packed(model.robot)
-    work, rate, torques = empty_scratch(), np.empty(11), np.empty(4)
-
-    def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        _derivative(control.code, rob, par, work, y, rate, torques)
-        return rate[:10].copy()
-
+    derivative = _right_side(control, model, 10)
     runs = [
         solve_ivp(derivative, (0.0, duration), start, "LSODA", rtol=1e-6, atol=1e-9)
         for start, duration in zip(starts, durations, strict=True)

@@ -62,7 +62,7 @@ DEFAULT_STAGES = (
     Stage(0.5, 0.1, 1.0, 20_000),
     Stage(0.25, 0.03, -0.02, 200_000),
 )
-"""Screen coarse, check finer, confirm as the issue asks."""
+"""Screen coarse, check finer, confirm on the finest mesh."""
 
 
 _RUNS, _MOST_RUNS = 4, 1000
