@@ -25,19 +25,14 @@ from biped_mfpt_ros.gait.step import simulate_steps
 from biped_mfpt_ros.report import html
 from biped_mfpt_ros.report.style import Picture
 from biped_mfpt_ros.study import work
-from biped_mfpt_ros.study.comparison import (
-    DIFFERS,
-    HOLDS,
-    INTERVAL,
-    UNKNOWN,
-    Results,
-    curves,
-    percent,
-    tables,
-)
+from biped_mfpt_ros.study.curves import curves
 from biped_mfpt_ros.study.plan import CURVE_DEG, PAPER_MESH, SIGMA_DEG, Job, make_plan, scheme_of
 from biped_mfpt_ros.study.readings import readings
+from biped_mfpt_ros.study.results import Results, percent
 from biped_mfpt_ros.study.store import Store
+from biped_mfpt_ros.study.table import INTERVAL
+from biped_mfpt_ros.study.tables import tables
+from biped_mfpt_ros.study.verdicts import DIFFERS, HOLDS, UNKNOWN
 from biped_mfpt_ros.walker.robot import WalkerModel
 from biped_mfpt_ros.walker.terrain import slope_set
 

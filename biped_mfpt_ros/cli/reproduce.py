@@ -33,10 +33,12 @@ from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
 from biped_mfpt_ros.report.style import Picture
 from biped_mfpt_ros.report.tables import difference, table
 from biped_mfpt_ros.study import work
-from biped_mfpt_ros.study.comparison import Results, curves, mfpt_of, tables
+from biped_mfpt_ros.study.curves import curves
 from biped_mfpt_ros.study.plan import SIGMA_DEG, Job, Plan, make_plan, scheme_of
 from biped_mfpt_ros.study.readings import readings
+from biped_mfpt_ros.study.results import Results, mfpt_of
 from biped_mfpt_ros.study.store import Store
+from biped_mfpt_ros.study.tables import tables
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.terrain import slope_set
 

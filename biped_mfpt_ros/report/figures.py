@@ -11,8 +11,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from biped_mfpt_ros.report import paper
 from biped_mfpt_ros.report.style import BODY, GRID, OURS, PAPER, Picture, new_figure, png, tidy
-from biped_mfpt_ros.study.comparison import Curve, Results, mfpt_of
+from biped_mfpt_ros.study.curves import Curve
 from biped_mfpt_ros.study.plan import SIGMA_DEG, scheme_of
+from biped_mfpt_ros.study.results import Results, mfpt_of
 
 _COLOURS = {"base": "#e08e1b", "cot": "#2a9d72", "mfpt": OURS}
 _MOST = 1e30  # steps: beyond it a curve tells nothing more

@@ -16,23 +16,21 @@ from biped_mfpt_ros.report import figures
 from biped_mfpt_ros.report.progress import duration_text
 from biped_mfpt_ros.report.style import Picture
 from biped_mfpt_ros.report.tables import difference, number
-from biped_mfpt_ros.study.comparison import (
+from biped_mfpt_ros.study.curves import Curve
+from biped_mfpt_ros.study.plan import scheme_of
+from biped_mfpt_ros.study.results import Results
+from biped_mfpt_ros.study.table import (
     COUNT,
     DIFFERENCE,
-    DIFFERS,
     FIXED,
-    HOLDS,
     INTERVAL,
-    PARTLY,
     SECONDS,
     SHARE,
     TEXT,
     Column,
-    Curve,
-    Results,
     Table,
 )
-from biped_mfpt_ros.study.plan import scheme_of
+from biped_mfpt_ros.study.verdicts import DIFFERS, HOLDS
 
 _STYLE = """
 :root { --ink: #1d232c; --soft: #5b6673; --line: #dde2e8; --wash: #f5f7fa; --blue: #1f5fa8;
@@ -99,7 +97,7 @@ def page(
     results : Results
         Of the study.
     tables : sequence of Table
-        As `comparison.tables` makes them.
+        As `study.tables.tables` makes them.
     curves : sequence of Curve
         Of Figures 2 and 3.
     pictures : mapping
@@ -221,7 +219,7 @@ def _tiles(results: Results, by: Mapping[str, Table]) -> str:
     tiles = []
     if "holds" in by:
         verdicts = [row["verdict"] for row in by["holds"].rows]
-        judged = sum(v in (HOLDS, PARTLY, DIFFERS) for v in verdicts)
+        judged = sum(v in (HOLDS, DIFFERS) for v in verdicts)
         tiles.append((f"{verdicts.count(HOLDS)} of {judged}", "of the paper's numbers hold"))
     meshes = [mesh for name in results.plan.controllers for mesh in results.meshes(name)]
     if meshes:

@@ -1,12 +1,9 @@
-"""Tables and curves of a study, every number beside the paper's."""
+"""Tables of a study, every number beside the paper's."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,199 +11,28 @@ import numpy as np
 from biped_mfpt_ros.control.controller import SCHEMES, controller
 from biped_mfpt_ros.control.hzd import DEGREE, hybrid_invariant_start
 from biped_mfpt_ros.report import paper
-from biped_mfpt_ros.study.plan import PAPER_MESH, SIGMA_DEG, TABLE_SIGMA_DEG, Plan, scheme_of
+from biped_mfpt_ros.study.plan import SIGMA_DEG, TABLE_SIGMA_DEG, scheme_of
 from biped_mfpt_ros.study.readings import readings
-
-COUNT, NUMBER, FIXED, DIFFERENCE, INTERVAL, TEXT, SECONDS, SHARE = (
-    "count", "number", "fixed", "difference", "interval", "text", "seconds", "share",
-)  # fmt: skip
-"""Kinds of columns: a whole number, one to five digits, one to four decimals, a difference in per
-cent, an interval ``[low, high]``, text, seconds, a share from 0 to 1."""
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a table: key, heading, and how its cells are shown."""
-
-    key: str
-    heading: str
-    kind: str = NUMBER
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the study.
-
-    Attributes
-    ----------
-    name : str
-        By which files and JSON know it.
-    title : str
-        What it shows.
-    columns : tuple of Column
-    rows : list of dict
-        Cells by the columns' keys; None where there is nothing.
-    notes : tuple of str
-        What has to be said about it.
-    """
-
-    name: str
-    title: str
-    columns: tuple[Column, ...]
-    rows: list[dict[str, Any]]
-    notes: tuple[str, ...] = ()
-
-    def csv(self) -> str:
-        """The rows as CSV; numbers read back exactly, an interval takes two columns."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        names: list[str] = []
-        for column in self.columns:
-            two = column.kind == INTERVAL
-            names += [f"{column.key}_low", f"{column.key}_high"] if two else [column.key]
-        writer.writerow(names)
-        for row in self.rows:
-            cells: list[Any] = []
-            for column in self.columns:
-                value = row.get(column.key)
-                cells += (value or [None, None]) if column.kind == INTERVAL else [value]
-            writer.writerow(["" if cell is None else cell for cell in cells])
-        return out.getvalue()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Name, title, rows and notes, for JSON."""
-        return {"title": self.title, "rows": self.rows, "notes": list(self.notes)}
-
-
-@dataclass(frozen=True)
-class Curve:
-    """MFPT of a controller over the standard deviation of the slope.
-
-    Attributes
-    ----------
-    controller : str
-    slope_step_deg, threshold : float
-        d_s (degrees) and d_thr of its mesh.
-    states : int
-        Of its mesh.
-    sigma_deg, mfpt : list of float
-        Degrees and steps.
-    paper : list of (float, float, str)
-        The paper's numbers: degrees, steps, ``"mesh"`` or ``"Monte Carlo"``.
-    walks : list of (float, float, float, float)
-        Monte Carlo here: degrees, steps, 95 % confidence interval.
-    """
-
-    controller: str
-    slope_step_deg: float
-    threshold: float
-    states: int
-    sigma_deg: list[float]
-    mfpt: list[float]
-    paper: list[tuple[float, float, str]] = field(default_factory=list)
-    walks: list[tuple[float, float, float, float]] = field(default_factory=list)
-
-
-class Results:
-    """The results of a plan's jobs that there are, by what they are.
-
-    Parameters
-    ----------
-    plan : Plan
-    results : mapping
-        Result by the job's name.
-    """
-
-    def __init__(self, plan: Plan, results: Mapping[str, dict[str, Any]]) -> None:
-        self.plan = plan
-        self._results = results
-
-    def _of(self, kind: str, name: str) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-        """Settings and result of each job of a kind and a controller."""
-        return [
-            (job.settings, self._results[job.name])
-            for job in self.plan.of(kind, name)
-            if job.name in self._results
-        ]
-
-    def cycle(self, name: str) -> dict[str, Any] | None:
-        """The limit cycle's job."""
-        return next((result for _, result in self._of("cycle", name)), None)
-
-    def meshes(self, name: str) -> list[dict[str, Any]]:
-        """Settings and results of the meshes, coarse to fine.
-
-        ``counted`` has the mean steps of walks by their sigma in degrees, as the mesh has them.
-        """
-        counted = {
-            (settings["slope_step_deg"], settings["threshold"]): dict(
-                zip(settings["sigma_deg"], result["mean_steps"], strict=True)
-            )
-            for settings, result in self._of("counted", name)
-        }
-        return [
-            settings
-            | result
-            | {"counted": counted.get((settings["slope_step_deg"], settings["threshold"]), {})}
-            for settings, result in self._of("mesh", name)
-        ]
-
-    def mesh(self, name: str, d_s: float, d_thr: float) -> dict[str, Any] | None:
-        """The mesh of given settings."""
-        for mesh in self.meshes(name):
-            if (mesh["slope_step_deg"], mesh["threshold"]) == (d_s, d_thr):
-                return mesh
-        return None
-
-    def paper_mesh(self, name: str) -> dict[str, Any] | None:
-        """The mesh of the paper's settings."""
-        return self.mesh(name, *PAPER_MESH[scheme_of(name)])
-
-    def finest(self, name: str) -> dict[str, Any] | None:
-        """The mesh that the figures are drawn of."""
-        job = (self.plan.of("mesh", name) or [None])[-1]
-        return None if job is None else self.mesh(
-            name, job.settings["slope_step_deg"], job.settings["threshold"]
-        )  # fmt: skip
-
-    def walks(self, name: str, sigma_deg: float) -> dict[str, Any] | None:
-        """Monte Carlo at a standard deviation."""
-        for settings, result in self._of("walks", name):
-            if settings["at_deg"] == sigma_deg:
-                return settings | result
-        return None
-
-    def tolerance(self, name: str) -> dict[str, Any] | None:
-        """Walks with several tolerances."""
-        return next((settings | result for settings, result in self._of("tolerance", name)), None)
-
-    def slopes(self) -> dict[str, Any] | None:
-        """Steps on constant slopes."""
-        return next((result for _, result in self._of("slopes", "hzd/base")), None)
-
-
-def mfpt_of(mesh: dict[str, Any] | None, sigma_deg: float) -> float | None:
-    """MFPT of a mesh's result at a standard deviation in degrees; None if there is none."""
-    if mesh is None:
-        return None
-    for at, value in zip(mesh["sigma_deg"], mesh["mfpt"], strict=True):
-        if at == sigma_deg:
-            return None if value is None else float(value)
-    return None
-
-
-def percent(value: float | None, reference: float | None) -> float | None:
-    """Difference from a reference in per cent; None where one is missing."""
-    if value is None or reference is None or not math.isfinite(reference) or reference == 0.0:
-        return None
-    return 100.0 * (value / reference - 1.0)
+from biped_mfpt_ros.study.results import Results, mfpt_of, percent
+from biped_mfpt_ros.study.table import (
+    COUNT,
+    DIFFERENCE,
+    FIXED,
+    INTERVAL,
+    SECONDS,
+    SHARE,
+    TEXT,
+    Column,
+    Table,
+)
+from biped_mfpt_ros.study.verdicts import verdicts
 
 
 def tables(results: Results) -> list[Table]:
     """Every table for which there is a result, in the order of a report."""
     names = {s: [n for n in results.plan.controllers if scheme_of(n) == s] for s in SCHEMES}
     found = [
-        _merit(results),
+        verdicts(results),
         _parameters_hzd(names["hzd"]),
         _gaits("table1_gaits", "Gaits of Table 1 on flat ground", results, names["hzd"]),
         _mfpt("table2", "Table 2: first scheme", results, names["hzd"]),
@@ -575,198 +401,3 @@ def model_text(name: str) -> str:
     limit = "no torque limit" if math.isinf(model.torque_limit) else f"{model.torque_limit:g} N m"
     text = f"{limit}, μ {model.friction:g}"
     return text + (f", slip {1e3 * model.slip_duration:g} ms" if model.slip_duration else "")
-
-
-def curves(results: Results) -> list[Curve]:
-    """Figures 2 and 3: MFPT over sigma_s, of one mesh of each controller."""
-    out = []
-    for n in results.plan.controllers:
-        mesh = results.finest(n)
-        if mesh is None:
-            continue
-        theirs, walked = [], []
-        for sigma in SIGMA_DEG[scheme_of(n)]:
-            for kind, value in (
-                ("mesh", paper.mfpt(n, 0.0, sigma)),
-                ("Monte Carlo", paper.monte_carlo(n, 0.0, sigma)),
-            ):
-                if value is not None:
-                    theirs.append((sigma, value, kind))
-            walk = results.walks(n, sigma)
-            if walk is not None and walk["low"] is not None:
-                walked.append((sigma, *(float(walk[k]) for k in ("mean_steps", "low", "high"))))
-        solved = [
-            (at, float(value))
-            for at, value in zip(mesh["sigma_deg"], mesh["mfpt"], strict=True)
-            if value is not None
-        ]
-        out.append(
-            Curve(
-                n,
-                mesh["slope_step_deg"],
-                mesh["threshold"],
-                mesh["states"],
-                [at for at, _ in solved],
-                [value for _, value in solved],
-                theirs,
-                walked,
-            )
-        )
-    return out
-
-
-# What holds -------------------------------------------------------------------------------------
-
-HOLDS, PARTLY, DIFFERS, UNKNOWN = "holds", "partly", "differs", "not checked"
-# Of the paper's numbers: Monte Carlo and the chain of the first scheme, Monte Carlo of the second.
-_WALKS_WITHIN = {"hzd": 5.0, "smc": 25.0}  # per cent
-_CHAIN_WITHIN = {"hzd": 10.0, "smc": 25.0}
-
-
-def _merit(results: Results) -> Table:
-    """Number by number, whether the paper's holds, and why not."""
-    rows = []
-    for n in results.plan.controllers:
-        scheme = scheme_of(n)
-        sigma = TABLE_SIGMA_DEG[scheme]
-        walked = results.walks(n, sigma)
-        rows.append(
-            _judged(
-                f"{n}: Monte Carlo at {sigma:g}°",
-                paper.monte_carlo(n, 0.0, sigma),
-                walked and float(walked["mean_steps"]),
-                "Monte Carlo",
-                _WALKS_WITHIN[scheme],
-                "the model's open settings (torque limit, friction, what counts as a slip)",
-            )
-        )
-        for at in (sigma, 1.0):
-            rows.append(_chain_row(results, n, at))
-    rows += [_order(results), *_claims(results)]
-    return Table(
-        "holds",
-        "What of the paper holds",
-        (
-            Column("number", "the paper's number", TEXT),
-            Column("verdict", "verdict", TEXT),
-            Column("paper", "paper"),
-            Column("here", "here"),
-            Column("difference", "difference", DIFFERENCE),
-            Column("by", "by", TEXT),
-            Column("why", "why", TEXT),
-        ),
-        rows,
-        (
-            "A number holds within 5 % (first scheme, Monte Carlo), 10 % (first scheme, chain) or "
-            "25 % (second scheme). Monte Carlo is judged by Monte Carlo, a chain by our finest "
-            "mesh.",
-        ),
-    )
-
-
-def _judged(
-    number: str, theirs: float | None, ours: float | None, by: str, within: float, else_why: str
-) -> dict[str, Any]:
-    difference = percent(ours, theirs)
-    row = {"number": number, "paper": theirs, "here": ours, "by": by, "difference": difference}
-    if difference is None:
-        return row | {"verdict": UNKNOWN, "why": "no result: no gait on flat ground, or stopped"}
-    if abs(difference) <= within:
-        return row | {"verdict": HOLDS, "why": ""}
-    return row | {"verdict": DIFFERS, "why": else_why}
-
-
-def _chain_row(results: Results, n: str, sigma: float) -> dict[str, Any]:
-    """A chain estimate of the paper, judged by the finest mesh: Monte Carlo counts otherwise."""
-    ours, theirs = mfpt_of(results.finest(n), sigma), paper.mfpt(n, 0.0, sigma)
-    coarse = mfpt_of(results.paper_mesh(n), sigma)
-    within = _CHAIN_WITHIN[scheme_of(n)]
-    row = _judged(f"{n}: chain at {sigma:g}°", theirs, ours, "finest mesh", within, "")
-    if row["verdict"] == DIFFERS and ours and theirs:
-        own = paper.monte_carlo(n, 0.0, sigma)
-        mesh = results.paper_mesh(n)
-        if own is not None and abs(percent(ours, own) or 0.0) <= _WALKS_WITHIN[scheme_of(n)]:
-            row["why"] = (
-                f"a coarse mesh: the paper's own Monte Carlo, {own:g}, is "
-                f"{percent(own, theirs):+.0f} % from it, and holds"
-            )
-        elif mesh is not None and coarse and _could_be_mesh(coarse, ours, theirs):
-            row["why"] = (
-                f"a coarse mesh: with the paper's d_s and d_thr {mesh['states']} states here, "
-                f"themselves {percent(coarse, ours):+.0f} % off"
-            )
-        else:
-            row["why"] = (
-                f"not the mesh, which is less off with the paper's d_s and d_thr ({coarse:.3g}): "
-                "what hangs on the model's open settings, and on rare falls most"
-                if coarse
-                else "unclear without a mesh of the paper's d_s and d_thr"
-            )
-    return row
-
-
-def _could_be_mesh(coarse: float, ours: float, theirs: float) -> bool:
-    """Whether our coarse mesh errs by a similar factor as the paper's number."""
-    return abs(math.log(coarse / ours)) >= 0.5 * abs(math.log(theirs / ours))
-
-
-def _claims(results: Results) -> list[dict[str, Any]]:
-    """What the paper says of constant slopes, section 6.3."""
-    cycles = {n: results.cycle(n) for n in results.plan.controllers}
-    none = [n for n, found in cycles.items() if not (found and found.get("stable"))]
-    walk = _claim(
-        "all walk on flat ground, stably",
-        not none,
-        f"no stable gait of {', '.join(none)}" if none else "with the models below",
-    )
-    found = results.slopes()
-    if found is None:
-        return [walk]
-    limited = [row for row in found["rows"] if math.isfinite(float(row["torque_limit"]))]
-    case = {(row["torques_off_late"], row["slope_deg"]): row for row in limited}
-    down, off, steep = case[False, -1.0], case[True, 0.0], case[True, -9.0]
-    return [
-        walk,
-        _claim(
-            "hzd/base takes no more than several steps down 1°",
-            down["fell"] is not None and down["steps"] <= 10,
-            f"{down['steps']} steps, then: {down['fell'] or 'walks on'}",
-        ),
-        _claim(
-            "hzd/base with no torque where τ > 0.95 walks on flat ground and down 9°",
-            off["fell"] is None and steep["fell"] is None,
-            f"flat: {off['steps']} steps, then: {off['fell'] or 'walks on'}; down 9°: "
-            f"{steep['steps']} steps, then: {steep['fell'] or 'walks on'}",
-        ),
-    ]
-
-
-def _claim(text: str, holds: bool, why: str) -> dict[str, Any]:
-    return {
-        "number": text,
-        "paper": None,
-        "here": None,
-        "by": "simulation",
-        "difference": None,
-        "verdict": HOLDS if holds else DIFFERS,
-        "why": why,
-    }
-
-
-def _order(results: Results) -> dict[str, Any]:
-    """The order of merit of Table 5."""
-    ours = {n: mfpt_of(results.finest(n), 1.0) for n in results.plan.controllers}
-    known = [n for n, value in ours.items() if value is not None]
-    row: dict[str, Any] = {
-        "number": "order of merit in Table 5", "paper": None, "here": None, "difference": None,
-        "by": "finest mesh", "verdict": UNKNOWN, "why": "",
-    }  # fmt: skip
-    if len(known) < 2:
-        return row | {"why": "one controller only"}
-    mine = sorted(known, key=lambda n: ours[n] or 0.0)
-    theirs = sorted(known, key=lambda n: paper.mfpt(n, 0.0, 1.0) or 0.0)
-    return row | {
-        "verdict": HOLDS if mine == theirs else DIFFERS,
-        "why": "here: " + " < ".join(mine) + ("" if mine == theirs else "; paper: "
-                                              + " < ".join(theirs)),
-    }  # fmt: skip
