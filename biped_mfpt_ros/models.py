@@ -17,9 +17,6 @@ ROBOT_FIELDS = tuple(field.name for field in dataclasses.fields(Robot))
 MODEL_FIELDS = tuple(f.name for f in dataclasses.fields(WalkerModel) if f.name != "robot")
 """Names of the values of a walker model, but for its robot."""
 
-_LEAST, _MOST = 1e-6, 1e6
-"""SI units: positive is not enough, as products of such values must neither overflow nor vanish."""
-
 
 def in_order(values: Mapping[str, Any], names: Sequence[str], field: str) -> list[Any]:
     """Values in the order of their names; raises InputError unless they have just these names."""
@@ -37,8 +34,7 @@ def robot_from(values: Mapping[str, Any], name: str = "robot") -> Robot:
     Parameters
     ----------
     values : mapping
-        A number for each of `ROBOT_FIELDS`, SI units. Centres of mass may lie anywhere along the
-        line of their link, all else is positive.
+        A number for each of `ROBOT_FIELDS`, SI units, in the ranges of `Robot`.
     name : str
         What errors call it.
 
@@ -52,12 +48,10 @@ def robot_from(values: Mapping[str, Any], name: str = "robot") -> Robot:
         If one is missing, unknown, no number, or out of its range.
     """
     numbers = in_order(values, ROBOT_FIELDS, name)
-    for field, value in zip(ROBOT_FIELDS, numbers, strict=True):
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        low = -_MOST if field.endswith("_com") else _LEAST
-        if not number or not low <= value <= _MOST:
-            raise InputError(f"{name}.{field}", value, f"a number from {low:g} to {_MOST:g}")
-    return Robot(*map(float, numbers))
+    try:
+        return Robot(*numbers)
+    except InputError as error:
+        raise InputError(f"{name}.{error.field}", error.value, error.allowed) from None
 
 
 def robot_from_file(path: str | Path) -> Robot:

@@ -27,16 +27,44 @@ def test_values_give_the_same_model_back():
     assert "robot" not in model_values(WalkerModel())
 
 
+BAD_VALUES = [
+    ("torso_mass", -1.0),
+    ("gravity", float("nan")),
+    ("femur_inertia", 0),
+    ("tibia_com", float("inf")),
+    ("femur_length", "0.4"),
+    ("femur_length", True),
+    ("femur_length", 10**400),
+    ("tibia_length", None),
+]
+
+
+@pytest.mark.parametrize(("field", "value"), BAD_VALUES)
+def test_a_robot_of_bad_values_cannot_be_made(field, value):
+    low = "-1e+06" if field == "tibia_com" else "1e-06"
+    with pytest.raises(InputError) as error:
+        dataclasses.replace(rabbit(), **{field: value})
+    assert error.value.field == field
+    assert error.value.value is value
+    assert error.value.allowed == f"a number from {low} to 1e+06"
+
+
+def test_the_values_of_a_robot_are_floats():
+    made = dataclasses.replace(rabbit(), torso_mass=12, torso_com=-1)
+    assert all(type(value) is float for value in dataclasses.astuple(made))
+
+
+@pytest.mark.parametrize("field", ["torque_limit", "friction", "time_limit", "tolerance"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), "1", True, None])
+def test_a_model_of_bad_values_cannot_be_made(field, value):
+    with pytest.raises(InputError, match=f"^{field}: "):
+        WalkerModel(**{field: value})
+
+
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        (RABBIT | {"torso_mass": -1.0}, "torso_mass"),
-        (RABBIT | {"gravity": float("nan")}, "gravity"),
-        (RABBIT | {"femur_inertia": 0}, "femur_inertia"),
-        (RABBIT | {"tibia_com": float("inf")}, "tibia_com"),
-        (RABBIT | {"femur_length": "0.4"}, "femur_length"),
-        (RABBIT | {"femur_length": True}, "femur_length"),
-        (RABBIT | {"femur_length": 10**400}, "femur_length"),
+        *((RABBIT | {field: value}, field) for field, value in BAD_VALUES),
         (RABBIT | {"arm_mass": 1.0}, "arm_mass"),
         ({k: v for k, v in RABBIT.items() if k != "gravity"}, "gravity"),
     ],

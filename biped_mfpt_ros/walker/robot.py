@@ -67,6 +67,12 @@ PACKED_SIZE = 96
 FRICTION_FRAMES = ("slope", "vertical")
 """Allowed values of `WalkerModel.friction_frame`."""
 
+# Of a robot, SI units: positive is not enough, products of such values must neither overflow nor
+# vanish.
+_LEAST, _MOST = 1e-6, 1e6
+
+_ABOVE_ZERO = math.ulp(0.0)
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -86,6 +92,12 @@ class Robot:
         kg m^2, about the link's own centre of mass.
     gravity : float
         m/s^2.
+
+    Raises
+    ------
+    InputError
+        If a value is no number from 1e-6 to 1e6, or for a centre of mass, which may lie anywhere
+        along the line of its link, from -1e6 to 1e6.
     """
 
     torso_mass: float
@@ -101,6 +113,13 @@ class Robot:
     femur_inertia: float
     tibia_inertia: float
     gravity: float
+
+    def __post_init__(self) -> None:
+        """Check every value, and make it a float."""
+        for name, value in vars(self).items():
+            low = -_MOST if name.endswith("_com") else _LEAST
+            _check(name, value, low, _MOST, f"a number from {low:g} to {_MOST:g}")
+            object.__setattr__(self, name, float(value))
 
     @property
     def mass(self) -> float:
@@ -217,11 +236,11 @@ class WalkerModel:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        _check("torque_limit", self.torque_limit, self.torque_limit > 0.0, "> 0 N m, inf for none")
-        _check("friction", self.friction, self.friction > 0.0, "> 0, inf for no slip")
-        _check("slip_duration", self.slip_duration, 0.0 <= self.slip_duration <= 1.0, "0 to 1 s")
-        _check("time_limit", self.time_limit, 0.0 < self.time_limit <= 60.0, "above 0, to 60 s")
-        _check("tolerance", self.tolerance, 1e-13 <= self.tolerance <= 1e-2, "1e-13 to 1e-2")
+        _check("torque_limit", self.torque_limit, _ABOVE_ZERO, math.inf, "> 0 N m, inf for none")
+        _check("friction", self.friction, _ABOVE_ZERO, math.inf, "> 0, inf for no slip")
+        _check("slip_duration", self.slip_duration, 0.0, 1.0, "0 to 1 s")
+        _check("time_limit", self.time_limit, _ABOVE_ZERO, 60.0, "above 0, to 60 s")
+        _check("tolerance", self.tolerance, 1e-13, 1e-2, "1e-13 to 1e-2")
         if self.friction_frame not in FRICTION_FRAMES:
             raise InputError("friction_frame", self.friction_frame, " or ".join(FRICTION_FRAMES))
 
@@ -252,6 +271,7 @@ class WalkerModel:
         return out
 
 
-def _check(name: str, value: float, holds: bool, allowed: str) -> None:
-    if not isinstance(value, (int, float)) or math.isnan(value) or not holds:
+def _check(name: str, value: float, low: float, high: float, allowed: str) -> None:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not low <= value <= high:
         raise InputError(name, value, allowed)
