@@ -61,9 +61,15 @@ def _output(par, i, tau, tau_rate, angle, rate):
 
 
 @inlined_kernel
+def _tau(par, a):
+    """Phase of the step (eq. 11): 0 at its start and 1 at its end on flat ground."""
+    return (-0.5 * (a[0] + a[2]) - par[_THETA_START]) * par[_SLOPE]
+
+
+@inlined_kernel
 def command(par, a, da):
     """Accelerations ``alpha + beta z`` of the five links with ``z = ddtheta`` (eq. 8 to 13)."""
-    tau = (-0.5 * (a[0] + a[2]) - par[_THETA_START]) * par[_SLOPE]
+    tau = _tau(par, a)
     rate = -0.5 * (da[0] + da[2]) * par[_SLOPE]
     a1, b1 = _output(par, 0, tau, rate, a[0] - a[4], da[0] - da[4])
     a2, b2 = _output(par, 1, tau, rate, a[1] - a[4], da[1] - da[4])
@@ -79,8 +85,7 @@ def command(par, a, da):
 @inner_kernel
 def switch(par, a):
     """Positive as long as torques are applied: ``tau_off - tau``."""
-    tau = (-0.5 * (a[0] + a[2]) - par[_THETA_START]) * par[_SLOPE]
-    return par[_OFF] - tau
+    return par[_OFF] - _tau(par, a)
 
 
 def double_support(joints: np.ndarray, robot: Robot) -> np.ndarray:
@@ -144,13 +149,8 @@ def hybrid_invariant_start(
         First two coefficients of q1 to q4, rad, shape (4,).
     """
     robot = robot or rabbit()
-    q = double_support(alpha6, robot)
-    theta_end, theta_start = phase(q), phase(swapped(q))
-    span = theta_end - theta_start
-    rates = np.empty(5)
-    rates[:4] = DEGREE * (alpha6 - alpha5) / span  # for dtheta = 1
-    rates[4] = -1.0 - rates[0] - 0.5 * rates[2]
-    after, _ = impact_map(np.concatenate([q, rates]), robot)
+    before, span = _before_impact(alpha5, alpha6, 1.0, robot)
+    after, _ = impact_map(before, robot)
     alpha0 = after[:4]
     alpha1 = alpha0 + after[5:9] / phase(after[5:]) * span / DEGREE
     return alpha0, alpha1
@@ -174,12 +174,20 @@ def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.nda
         ``[q, dq]``, rad and rad/s, shape (10,).
     """
     bezier = parameters[2 : 2 + 4 * (DEGREE + 1)].reshape(4, DEGREE + 1)
-    q = double_support(bezier[:, DEGREE], robot)
+    before, _ = _before_impact(bezier[:, DEGREE - 1], bezier[:, DEGREE], rate, robot)
+    return impact_map(before, robot)[0]
+
+
+def _before_impact(
+    alpha5: np.ndarray, alpha6: np.ndarray, rate: float, robot: Robot
+) -> tuple[np.ndarray, float]:
+    """State at the end of a step on flat ground without tracking error, and theta- - theta+."""
+    q = double_support(alpha6, robot)
     span = phase(q) - phase(swapped(q))
     rates = np.empty(5)
-    rates[:4] = DEGREE * (bezier[:, DEGREE] - bezier[:, DEGREE - 1]) / span * rate
+    rates[:4] = DEGREE * (alpha6 - alpha5) / span * rate
     rates[4] = -rate - rates[0] - 0.5 * rates[2]
-    return impact_map(np.concatenate([q, rates]), robot)[0]
+    return np.concatenate([q, rates]), span
 
 
 def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:

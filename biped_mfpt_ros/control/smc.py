@@ -144,6 +144,13 @@ def _with_sign(size, x):
 
 
 @inlined_kernel
+def _sigma(par, i, switched, value, rate):
+    """The variable sigma of one output (eq. 18), and dh / tau; ``switched`` is 0 or 1."""
+    reference = par[_REF1 + i] + switched * (par[_REF2 + i] - par[_REF1 + i])
+    return rate + (value - reference) * par[_RATE + i], rate * par[_RATE + i]
+
+
+@inlined_kernel
 def _distance(rate, k, exponent):
     """``|sigma|`` on the slow manifold of eq. (21) to first order, where the law is ``rate``."""
     if exponent > 0.0:
@@ -206,14 +213,11 @@ def _sliding(sigma, rate, distance, inverse_tau, exponent):
 @inlined_kernel
 def _output(par, i, switched, slides, value, rate):
     """Acceleration of one output (eq. 18, 21); ``switched`` and ``slides`` are 0 or 1."""
-    inverse_tau = par[_RATE + i]
-    reference = par[_REF1 + i] + switched * (par[_REF2 + i] - par[_REF1 + i])
-    sigma = rate + (value - reference) * inverse_tau
     k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
-    slow_rate = rate * inverse_tau
+    sigma, slow_rate = _sigma(par, i, switched, value, rate)
     distance = _distance(slow_rate, k, exponent)
     law = _law(sigma, slow_rate, distance, k, exponent, width)
-    along = _sliding(sigma, slow_rate, distance, inverse_tau, exponent)
+    along = _sliding(sigma, slow_rate, distance, par[_RATE + i], exponent)
     return -select(slides > 0.5, along, law)
 
 
@@ -245,14 +249,11 @@ def off_slide(par, i, a, da, switched):
         value, rate = a[3] - a[1], da[3] - da[1]
     elif i == 3:
         value, rate = a[4], da[4]
-    inverse_tau = par[_RATE + i]
-    reference = par[_REF1 + i] + switched * (par[_REF2 + i] - par[_REF1 + i])
-    sigma = rate + (value - reference) * inverse_tau
-    slow_rate = rate * inverse_tau
     k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
+    sigma, slow_rate = _sigma(par, i, switched, value, rate)
     distance = _distance(slow_rate, k, exponent)
     slope = _slope(slow_rate, distance, exponent)
-    g = slope * inverse_tau / exponent if exponent > 0.0 else 0.0 * slope
+    g = slope * par[_RATE + i] / exponent if exponent > 0.0 else 0.0 * slope
     _, slides = _slow(slow_rate, distance, exponent, width)
     law = _law(sigma, slow_rate, distance, k, exponent, width)
     off = abs(law - slow_rate) / (SLIDING_RATE * ENTRY + 2.0 * g * abs(slow_rate))
