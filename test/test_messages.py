@@ -2,6 +2,7 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import hypothesis
 import numpy as np
 import pytest
 from biped_mfpt_msgs.msg import Controller as ControllerMsg
@@ -25,6 +26,7 @@ from biped_mfpt_ros.nodes.messages import MeshSettings
 from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import slope_set
 
+PATIENT = hypothesis.settings(deadline=None)  # others use the machine too
 NANS = [math.nan] * len(controller("hzd/base").parameters)
 
 
@@ -37,12 +39,14 @@ def same_bits(a, b):
     return np.asarray(a).tobytes() == np.asarray(b).tobytes()
 
 
+@PATIENT
 @given(npst.arrays(np.float64, npst.array_shapes(max_dims=2, min_side=0, max_side=7)))
 def test_float_arrays_keep_every_bit(values):
     message = sent(MeshStates(states=messages.packed(values, "d")))
     assert same_bits(messages.unpacked(message.states, "d"), values)
 
 
+@PATIENT
 @given(npst.arrays(np.uint32, st.integers(0, 20)), npst.arrays(np.uint8, st.integers(0, 20)))
 def test_integer_arrays_survive(targets, outcomes):
     message = sent(
@@ -76,6 +80,7 @@ def test_controller_with_infinite_limit_round_trip():
     assert same_bits(got.parameters, walking.parameters)
 
 
+@PATIENT
 @given(
     st.floats(min_value=0.0, exclude_min=True),
     st.floats(min_value=0.0, exclude_min=True),
@@ -247,6 +252,7 @@ def some_steps(draw):
     return Steps(outcomes, next_states, *measures, 0.25, 17, 119)
 
 
+@PATIENT
 @given(some_steps())
 def test_steps_round_trip(steps):
     response = SimulateSteps.Response()
@@ -355,6 +361,7 @@ def test_published_messages_are_about_a_megabyte(mesh):
         assert len(serialize_message(message)) < messages.MESSAGE_BYTES + 1000
 
 
+@PATIENT
 @given(st.randoms(use_true_random=False), st.booleans())
 def test_mesh_is_assembled_in_whichever_order_its_messages_come(assembly_cases, random, in_order):
     # A late subscriber may even get the new messages of a topic before those kept for it.
