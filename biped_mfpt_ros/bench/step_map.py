@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from biped_mfpt_ros.bench import rigid_body
+from biped_mfpt_ros.bench import measure, rigid_body
 from biped_mfpt_ros.bench.flops import counted_flops
 from biped_mfpt_ros.bench.measure import SLOPES, BenchError, Section, row
 from biped_mfpt_ros.control.controller import Controller, controller, paper_controller_names
@@ -42,13 +42,7 @@ def timed(work: Callable[[], object], repetitions: int) -> np.ndarray:
     All that is timed here works on one core and waits for nothing, so what else the machine does
     matters little, nor do the threads of a linear algebra library that wait in a loop.
     """
-    work()
-    out = np.empty(repetitions)
-    for i in range(repetitions):
-        start = time.thread_time()
-        work()
-        out[i] = time.thread_time() - start
-    return out
+    return measure.timed(work, repetitions, time.thread_time)
 
 
 def reached(
