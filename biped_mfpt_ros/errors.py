@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Number
+
 
 class InputError(ValueError):
     """A value given by the user or by another node is not allowed.
@@ -20,7 +22,7 @@ class InputError(ValueError):
         self.field = field
         self.value = value
         self.allowed = allowed
-        shown = repr(value)
+        shown = str(value) if isinstance(value, Number) else repr(value)  # numpy's, too
         if len(shown) > 200:
             shown = shown[:197] + "..."
         super().__init__(f"{field}: {shown} is not allowed; allowed: {allowed}")

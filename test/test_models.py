@@ -49,6 +49,11 @@ def test_a_robot_of_bad_values_cannot_be_made(field, value):
     assert error.value.allowed == f"a number from {low} to 1e+06"
 
 
+def test_a_number_of_numpy_is_shown_as_a_plain_one():
+    with pytest.raises(InputError, match=r"^friction: -0\.5 is not allowed"):
+        WalkerModel(friction=np.float64(-0.5))
+
+
 def test_the_values_of_a_robot_are_floats():
     made = dataclasses.replace(rabbit(), torso_mass=12, torso_com=-1)
     assert all(type(value) is float for value in dataclasses.astuple(made))

@@ -14,7 +14,7 @@ from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.report import paper, pictures
 from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text, rate_text
-from biped_mfpt_ros.report.tables import difference, number, table
+from biped_mfpt_ros.report.tables import difference, number, plural, table
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
@@ -176,6 +176,9 @@ class TestTables:
     )
     def test_number(self, value, text):
         assert number(value) == text
+
+    def test_plural(self):
+        assert [plural(n, "state") for n in (0, 1, 2)] == ["0 states", "1 state", "2 states"]
 
     def test_difference(self):
         assert difference(110.0, 100.0) == "+10.0 %"

@@ -86,8 +86,8 @@ class MeshLimitError(RuntimeError):
         self.threshold = threshold
         super().__init__(
             f"the mesh would hold more than max_states = {max_states} states, in generation "
-            f"{generation}, after {explored} states were simulated; allow more states or a "
-            f"threshold above {threshold:g}"
+            f"{generation}, with {explored} simulated; allow more states or a threshold above "
+            f"{threshold:g}"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -23,7 +23,7 @@ from biped_mfpt_ros.optimise.settings import DEFAULT_STAGES, Stage, StudySetting
 from biped_mfpt_ros.optimise.store import Store, Trial
 from biped_mfpt_ros.optimise.study import Study, best_trial, confirming
 from biped_mfpt_ros.report.progress import Progress, duration_text, rate_text
-from biped_mfpt_ros.report.tables import number
+from biped_mfpt_ros.report.tables import number, plural
 
 
 def optimise(args: argparse.Namespace) -> None:
@@ -52,8 +52,8 @@ def optimise(args: argparse.Namespace) -> None:
     with work(args.quiet) as progress:
         tally = _Tally(study, progress, workers, args.trials, args.seconds)
         progress.say(
-            f"study {name} in {args.store}: {len(study.space)} free parameters, "
-            f"{len(tally.before)} trials so far"
+            f"study {name} in {args.store}: {plural(len(study.space), 'free parameter')}, "
+            f"{plural(len(tally.before), 'trial')} so far"
         )
         if args.local:
             ended = _locally(study, workers, args, tally)
@@ -80,10 +80,10 @@ def optimise(args: argparse.Namespace) -> None:
         return
     print(text)
     print(
-        f"\n{tally.done} trials in {duration_text(tally.seconds)}, "
+        f"\n{plural(tally.done, 'trial')} in {duration_text(tally.seconds)}, "
         f"{rate_text(result['trials_per_second'])} a second; "
-        f"{100.0 * result['outside_step_map']:.0f} % of the time of {workers} workers was spent "
-        "outside of the step map"
+        f"{100.0 * result['outside_step_map']:.0f} % of the time of "
+        f"{plural(workers, 'worker')} was spent outside of the step map"
     )
 
 
@@ -219,7 +219,8 @@ class _Tally:
         throughput = self.throughput()
         rate = throughput["trials_per_second"]
         total = len(self.before) + self.done
-        parts = [f"{total} trials" if self._limit is None else f"{total} of {self._limit} trials"]
+        limit = self._limit
+        parts = [plural(total, "trial") if limit is None else f"{total} of {limit} trials"]
         parts.append(f"best {self._best_text}")
         if self._runs:
             scores = ", ".join(score_text(row) for row in self._runs)

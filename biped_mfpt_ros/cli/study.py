@@ -13,7 +13,7 @@ from biped_mfpt_ros.control.controller import SCHEMES, Controller, catalogue_row
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.store import Store, Trial
 from biped_mfpt_ros.optimise.study import Study, best_trial
-from biped_mfpt_ros.report.tables import table
+from biped_mfpt_ros.report.tables import plural, table
 
 
 def study(args: argparse.Namespace) -> None:
@@ -168,13 +168,14 @@ def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
         assert t.found is not None
         stages[t.found.stage] = stages.get(t.found.stage, 0) + 1
     counts = ", ".join(f"{count} {stage}" for stage, count in sorted(stages.items()))
-    lines = [f"study {study.name}: {len(done)} trials ({counts})"]
+    lines = [f"study {study.name}: {plural(len(done), 'trial')} ({counts})"]
     if rows := run_rows(study, trials):
         left = study.runs_left()
         for row in rows:
             ended = "" if row["run"] in left else ", ended"
             lines.append(
-                f"run {row['run']}: {row['trials']} trials, best score {score_text(row)}{ended}"
+                f"run {row['run']}: {plural(row['trials'], 'trial')}, "
+                f"best score {score_text(row)}{ended}"
             )
         if len(left) > 1:
             lines.append(f"{len(left)} runs share the trials until one is left: it takes more")

@@ -44,6 +44,7 @@ from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.space import SearchSpace
 from biped_mfpt_ros.optimise.store import Store, Trial
 from biped_mfpt_ros.optimise.study import Study, best_trial
+from biped_mfpt_ros.report.tables import plural
 
 MOST_REFUSED = 64
 """Goals that are told within 10 s that another study runs; more are rejected without a word."""
@@ -192,7 +193,7 @@ class Optimiser(Node):
                     self._best.publish(trial_message(study, trial, best=True))
                 goal.publish_feedback(Optimise.Feedback(trial=message, trials=count))
 
-            self.get_logger().info(f"study {study.name}: {count} trials so far")
+            self.get_logger().info(f"study {study.name}: {plural(count, 'trial')} so far")
             ended = study.run(
                 self._backend,
                 now.trials_at_once,
@@ -201,7 +202,7 @@ class Optimiser(Node):
                 on_trial,
                 self._stop,
             )
-            self.get_logger().info(f"study {study.name}: {count} trials, ended: {ended}")
+            self.get_logger().info(f"study {study.name}: {plural(count, 'trial')}, ended: {ended}")
             result.trials = count
             if best is not None:
                 result.best = trial_message(study, best, best=True)

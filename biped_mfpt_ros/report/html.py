@@ -15,7 +15,7 @@ from biped_mfpt_ros.jit import STEP_MAP
 from biped_mfpt_ros.report import figures
 from biped_mfpt_ros.report.progress import duration_text
 from biped_mfpt_ros.report.style import Picture
-from biped_mfpt_ros.report.tables import difference, number
+from biped_mfpt_ros.report.tables import difference, number, plural
 from biped_mfpt_ros.study.curves import Curve
 from biped_mfpt_ros.study.plan import scheme_of
 from biped_mfpt_ros.study.results import Results
@@ -385,7 +385,7 @@ def _computed(results: Results, seconds: Mapping[str, float]) -> str:
         "<p>Meshes were grown by ROS 2 nodes: a mesher that keeps all simulators busy, an analysis "
         "that solves the chain, and a recorder for each mesh. Limit cycles, walks and pictures "
         "were computed by one process for each core. Monte Carlo of Tables 2 and 4: "
-        f"{results.plan.walks} walks of each controller.</p>"
+        f"{plural(results.plan.walks, 'walk')} of each controller.</p>"
         + _table(Table("times", "Times of this run, jobs side by side added up; what was there "
                        "already took none", columns, rows))
     )  # fmt: skip

@@ -7,6 +7,8 @@ import sys
 import time
 from typing import TextIO
 
+from biped_mfpt_ros.report.tables import plural
+
 _TERMINAL_INTERVAL = 0.1  # s between redrawn lines on a terminal
 _PLAIN_INTERVAL = 10.0  # s between lines where they stay, such as in a log
 
@@ -156,7 +158,7 @@ class MeshProgress:
         if generation != self._generation:
             self._previous_size, self._size = self._size, frontier
             self._generation = generation
-        parts = [f"mesh: {states} states", f"frontier {frontier}"]
+        parts = [f"mesh: {plural(states, 'state')}", f"frontier {frontier}"]
         parts.append(f"{rate_text(swings_per_second)} swings/s")
         if frontier == 0:
             parts.append("finishing")
@@ -167,7 +169,7 @@ class MeshProgress:
         else:
             parts.append("still growing")
         if simulators is not None:
-            parts.append(f"{simulators} simulator{'' if simulators == 1 else 's'}")
+            parts.append(plural(simulators, "simulator"))
         return ", ".join(parts)
 
 

@@ -17,6 +17,7 @@ from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.store import Trial
 from biped_mfpt_ros.optimise.study import Study
 from biped_mfpt_ros.report.style import OURS, PAPER, Picture, new_figure, png, tidy
+from biped_mfpt_ros.report.tables import plural
 from biped_mfpt_ros.study.readings import readings
 
 _COLOURS = (OURS, "#e08e1b", "#2a8c5a", "#8a4fae", "#333a45")
@@ -53,7 +54,7 @@ def history(study: Study) -> Picture:
     axes.legend(frameon=False)
     tidy(axes)
     caption = (
-        f"Study {study.name}: {len(done)} trials of {study.settings.searcher} from "
+        f"Study {study.name}: {plural(len(done), 'trial')} of {study.settings.searcher} from "
         f"{study.settings.start.name}, {len(gaits)} with a stable gait within the constraints, "
         f"{len(confirmed)} confirmed. The line is the best confirmed score so far."
     )

@@ -56,6 +56,11 @@ def number(value: object) -> str:
     return f"{value:.5g}" if 1e-3 <= abs(value) < 1e5 or value == 0.0 else f"{value:.3e}"
 
 
+def plural(number: int, noun: str) -> str:
+    """How many there are of something, such as ``"1 state"`` or ``"2 states"``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def difference(value: float, reference: float) -> str:
     """Difference from a reference, such as ``"+3.2 %"``, or ``"x 1500"`` beyond a factor of 10."""
     ratio = value / reference

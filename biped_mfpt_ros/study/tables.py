@@ -11,6 +11,7 @@ import numpy as np
 from biped_mfpt_ros.control.controller import SCHEMES, controller
 from biped_mfpt_ros.control.hzd import DEGREE, hybrid_invariant_start
 from biped_mfpt_ros.report import paper
+from biped_mfpt_ros.report.tables import plural
 from biped_mfpt_ros.study.plan import SIGMA_DEG, TABLE_SIGMA_DEG, scheme_of
 from biped_mfpt_ros.study.readings import readings
 from biped_mfpt_ros.study.results import Results, mfpt_of, percent
@@ -192,7 +193,8 @@ def _mfpt(name: str, title: str, results: Results, names: Sequence[str]) -> Tabl
                 {
                     "controller": n,
                     "estimate": "Monte Carlo",
-                    "settings": f"{walked['walks']} walks, {walked['counted_walks']} counted",
+                    "settings": f"{plural(walked['walks'], 'walk')}, "
+                    f"{walked['counted_walks']} counted",
                     "paper": theirs["walks"],
                     "here": value,
                     "interval": [walked["low"], walked["high"]],

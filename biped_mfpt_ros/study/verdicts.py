@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from biped_mfpt_ros.report import paper
+from biped_mfpt_ros.report.tables import plural
 from biped_mfpt_ros.study.plan import TABLE_SIGMA_DEG, scheme_of
 from biped_mfpt_ros.study.results import Results, mfpt_of, percent
 from biped_mfpt_ros.study.table import DIFFERENCE, TEXT, Column, Table
@@ -123,13 +124,13 @@ def _claims(results: Results) -> list[dict[str, Any]]:
         _claim(
             "hzd/base takes no more than several steps down 1°",
             down["fell"] is not None and down["steps"] <= 10,
-            f"{down['steps']} steps, then: {down['fell'] or 'walks on'}",
+            f"{plural(down['steps'], 'step')}, then: {down['fell'] or 'walks on'}",
         ),
         _claim(
             "hzd/base with no torque where τ > 0.95 walks on flat ground and down 9°",
             off["fell"] is None and steep["fell"] is None,
-            f"flat: {off['steps']} steps, then: {off['fell'] or 'walks on'}; down 9°: "
-            f"{steep['steps']} steps, then: {steep['fell'] or 'walks on'}",
+            f"flat: {plural(off['steps'], 'step')}, then: {off['fell'] or 'walks on'}; down 9°: "
+            f"{plural(steep['steps'], 'step')}, then: {steep['fell'] or 'walks on'}",
         ),
     ]
 
