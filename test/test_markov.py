@@ -51,6 +51,12 @@ def solve(rows, probabilities, code=2) -> Metastability:
     return solve_chain(targets, outcomes, probabilities)
 
 
+def solve_columns(targets, outcomes, columns) -> list:
+    """Many distributions, none of which depends on the slope before."""
+    offsets = np.zeros(len(targets), dtype=np.int64)
+    return markov._solve(targets, outcomes, offsets, np.ascontiguousarray(columns.T))
+
+
 def exact_chain(rows, probabilities) -> tuple[mpmath.matrix, list]:
     """I - Q and the falls, exact sums of the given probabilities scaled to sum exactly 1."""
     exact = [mpmath.mpf(float(p)) for p in probabilities]
@@ -473,7 +479,7 @@ def test_columns_that_settle_at_different_times_do_not_mix():
     columns = np.array(
         [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0.5, 0.5], [0.1, 0.2, 0.3, 0.4]]
     )
-    found = markov._solve(targets, outcomes, np.ascontiguousarray(columns.T))
+    found = solve_columns(targets, outcomes, columns)
     assert [found[0].mfpt, found[1].mfpt, found[2].mfpt] == [1.0, 1.0, math.inf]
     for p, result in zip(columns, found, strict=True):
         assert_same_bits(result, solve_chain(targets, outcomes, p))
@@ -492,7 +498,7 @@ def test_fall_back_of_one_column_leaves_the_others(monkeypatch):
     outcomes = np.where(targets == 0, 9, 0).astype(np.uint8)
     outcomes[0] = NOT_SIMULATED
     columns = np.array([[0.4, 0.1, 0.2, 0.3], [1.0 - 3e-9, 1e-9, 1e-12, 2e-9]])
-    found = markov._solve(targets, outcomes, np.ascontiguousarray(columns.T))
+    found = solve_columns(targets, outcomes, columns)
     for p, result in zip(columns, found, strict=True):
         assert relative(result.mfpt, 1 / exact_failure_probability(rows, p)) < RELATIVE
 
@@ -705,7 +711,7 @@ def test_an_unsolved_distribution_leaves_the_others(monkeypatch, only_iteration)
     outcomes = np.where(targets == 0, 9, 0).astype(np.uint8)
     outcomes[0] = NOT_SIMULATED
     columns = np.array([[1.0 - 3e-9, 1e-9, 1e-12, 2e-9], [0.4, 0.1, 0.2, 0.3]])
-    slow, found = markov._solve(targets, outcomes, np.ascontiguousarray(columns.T))
+    slow, found = solve_columns(targets, outcomes, columns)
     assert isinstance(slow, ChainError)
     assert_same_bits(found, solve_chain(targets, outcomes, columns[1]))
 

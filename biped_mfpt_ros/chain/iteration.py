@@ -5,7 +5,11 @@ state. Columns do not mix: each is computed in the same order of operations what
 it, so a result has the same bits alone and among fifty. What columns share is the structure of
 the chain, which costs most of the time to read.
 
-The structure lists for every state those that lead to it and over which slope (`incoming`), so
+How likely a transition is depends on its class: on the slope s that it goes over, and where slopes
+are correlated also on the slope r before it, which the state that it starts from tells. Class is
+`offsets[i] + s`, for state i; the offset is 0, or r times the number of slopes.
+
+The structure lists for every state those that lead to it and the class (`incoming`), so
 that a step only reads scattered memory, and writes in order. The states of a mesh are numbered as
 they were found, so that neighbours are mostly siblings, reached from the same states: these are
 in the cache.
@@ -44,25 +48,24 @@ _OPERATIONS_PER_SECOND = 2e9  # about, of _advance
 
 
 @kernel
-def _count(targets, slopes, outward, starts):
+def _count(targets, offsets, possible, outward, starts):
     for i in range(1, targets.shape[0]):
-        for k in range(slopes.shape[0]):
-            j = targets[i, slopes[k]]
-            if j != 0:
+        for s in range(targets.shape[1]):
+            j = targets[i, s]
+            if j != 0 and possible[offsets[i] + s]:
                 starts[(i if outward else np.int64(j)) + 1] += 1
     for j in range(targets.shape[0]):
         starts[j + 1] += starts[j]
 
 
 @kernel
-def _enter(targets, slopes, outward, shift, filled, entries):
+def _enter(targets, offsets, possible, outward, shift, filled, entries):
     for i in range(1, targets.shape[0]):
-        for k in range(slopes.shape[0]):
-            s = slopes[k]
+        for s in range(targets.shape[1]):
             j = np.int64(targets[i, s])
-            if j != 0:
+            if j != 0 and possible[offsets[i] + s]:
                 at, other = (i, j) if outward else (j, np.int64(i))
-                entries[filled[at]] = (other << shift) | s
+                entries[filled[at]] = (other << shift) | (offsets[i] + s)
                 filled[at] += 1
 
 
@@ -75,10 +78,10 @@ class Structure:
     starts : numpy.ndarray
         int64, shape (n + 1,): those of state j are `entries[starts[j] : starts[j + 1]]`.
     entries : numpy.ndarray
-        The state at the other end, shifted left, and the slope in the lower bits; uint32, or
+        The state at the other end, shifted left, and the class in the lower bits; uint32, or
         uint64 where that is too narrow.
     shift : int
-        Bits for the slope.
+        Bits for the class.
     """
 
     starts: np.ndarray
@@ -86,24 +89,26 @@ class Structure:
     shift: int
 
 
-def _structure(targets: np.ndarray, slopes: np.ndarray, outward: bool) -> Structure:
-    n, m = targets.shape
-    shift = max(1, (m - 1).bit_length())
+def _structure(
+    targets: np.ndarray, offsets: np.ndarray, possible: np.ndarray, outward: bool
+) -> Structure:
+    n = len(targets)
+    shift = max(1, (len(possible) - 1).bit_length())
     starts = np.zeros(n + 1, dtype=np.int64)
-    _count(targets, slopes, outward, starts)
+    _count(targets, offsets, possible, outward, starts)
     entries = np.empty(starts[n], dtype=np.uint32 if n << shift <= 2**32 else np.uint64)
-    _enter(targets, slopes, outward, shift, starts[:-1].copy(), entries)
+    _enter(targets, offsets, possible, outward, shift, starts[:-1].copy(), entries)
     return Structure(starts, entries, shift)
 
 
-def incoming(targets: np.ndarray, slopes: np.ndarray) -> Structure:
-    """Transitions over some slopes (their indices, int64) by the state that they lead to."""
-    return _structure(targets, slopes, False)
+def incoming(targets: np.ndarray, offsets: np.ndarray, possible: np.ndarray) -> Structure:
+    """Transitions of the possible classes, bool, (classes,), by the state that they lead to."""
+    return _structure(targets, offsets, possible, False)
 
 
-def outgoing(targets: np.ndarray, slopes: np.ndarray) -> Structure:
-    """Transitions over some slopes (their indices, int64) by the state that they start from."""
-    return _structure(targets, slopes, True)
+def outgoing(targets: np.ndarray, offsets: np.ndarray, possible: np.ndarray) -> Structure:
+    """Transitions of the possible classes, bool, (classes,), by the state that they start from."""
+    return _structure(targets, offsets, possible, True)
 
 
 @kernel
@@ -297,8 +302,8 @@ def settle(
     structure : Structure
         `incoming` to step distributions forward, `outgoing` to step functions of the state back.
     probabilities : numpy.ndarray
-        P_S of each column, shape (m, width), width as `padded` says; what is beyond the columns
-        is ignored.
+        Of each class and column, shape (classes, width), width as `padded` says; what is beyond
+        the columns is ignored.
     begin : numpy.ndarray
         State that has all the weight at first, int64, shape (columns,).
     weights, factors : numpy.ndarray
@@ -345,7 +350,7 @@ def settle(
 
 
 @kernel
-def fall_probabilities(targets, p, out):
+def fall_probabilities(targets, offsets, p, out):
     """out[i, c] = probability to fall in the next step from state i, for column c."""
     for i in range(1, targets.shape[0]):
         for c in range(out.shape[1]):
@@ -353,11 +358,11 @@ def fall_probabilities(targets, p, out):
         for s in range(targets.shape[1]):
             if targets[i, s] == 0:
                 for c in range(out.shape[1]):
-                    out[i, c] += p[s, c]
+                    out[i, c] += p[offsets[i] + s, c]
 
 
 @kernel
-def account(targets, outcomes, p, x, by_code, survives):
+def account(targets, outcomes, offsets, p, x, by_code, survives):
     """Where a step from distribution x goes: `by_code` to falls by outcome code, or it survives.
 
     Both are set; shapes (codes, columns) and (columns,).
@@ -369,13 +374,14 @@ def account(targets, outcomes, p, x, by_code, survives):
     survives[:] = 0.0
     for i in range(1, n):
         for s in range(targets.shape[1]):
+            k = offsets[i] + s
             if targets[i, s] == 0:
                 code = outcomes[i, s]
                 for c in range(width):
-                    part[code, c] += x[i, c] * p[s, c]
+                    part[code, c] += x[i, c] * p[k, c]
             else:
                 for c in range(width):
-                    living[c] += x[i, c] * p[s, c]
+                    living[c] += x[i, c] * p[k, c]
         if i % _ROWS == 0 or i == n - 1:
             by_code += part
             survives += living
@@ -384,14 +390,14 @@ def account(targets, outcomes, p, x, by_code, survives):
 
 
 @kernel
-def step_backward(targets, probabilities, x, out):
+def step_backward(targets, offsets, probabilities, x, out):
     """`out` = T x for a function x of the state, with 0 for the failure state."""
     out[0] = 0.0
     for i in range(1, targets.shape[0]):
         total = 0.0
         for s in range(targets.shape[1]):
             if targets[i, s] != 0:
-                total += probabilities[s] * x[targets[i, s]]
+                total += probabilities[offsets[i] + s] * x[targets[i, s]]
         out[i] = total
 
 
@@ -399,48 +405,50 @@ def step_backward(targets, probabilities, x, out):
 
 
 @kernel
-def _reachable(targets, slopes, out, queue):
+def _reachable(targets, offsets, possible, out, queue):
     """Mark in `out` the states that can be reached from queue[0], itself included."""
     out[queue[0]] = True
     waiting = 1
     while waiting > 0:
         waiting -= 1
         i = queue[waiting]
-        for k in range(slopes.shape[0]):
-            j = targets[i, slopes[k]]
-            if not out[j]:
+        for s in range(targets.shape[1]):
+            j = targets[i, s]
+            if possible[offsets[i] + s] and not out[j]:
                 out[j] = True
                 queue[waiting] = j
                 waiting += 1
 
 
 @kernel
-def can_reach(targets, slopes, out):
+def can_reach(targets, offsets, possible, out):
     """Mark in `out` also the states from which one can reach those already marked."""
     changed = True
     while changed:
         changed = False
         for i in range(targets.shape[0] - 1, 0, -1):
             if not out[i]:
-                for k in range(slopes.shape[0]):
-                    if out[targets[i, slopes[k]]]:
+                for s in range(targets.shape[1]):
+                    if possible[offsets[i] + s] and out[targets[i, s]]:
                         out[i] = True
                         changed = True
                         break
 
 
-def reachable(targets: np.ndarray, slopes: np.ndarray, start: int) -> np.ndarray:
-    """Whether each state can be reached from `start` over some slopes (indices), bool, (n,)."""
+def reachable(
+    targets: np.ndarray, offsets: np.ndarray, possible: np.ndarray, start: int
+) -> np.ndarray:
+    """Whether each state can be reached from `start` over possible classes, bool, (n,)."""
     out = np.zeros(len(targets), dtype=np.bool_)
     queue = np.empty(len(targets), dtype=np.int64)
     queue[0] = start
-    _reachable(targets, slopes, out, queue)
+    _reachable(targets, offsets, possible, out, queue)
     return out
 
 
-def can_fall(targets: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Whether a fall can be reached from each state over some slopes (indices), bool, (n,)."""
+def can_fall(targets: np.ndarray, offsets: np.ndarray, possible: np.ndarray) -> np.ndarray:
+    """Whether a fall can be reached from each state over possible classes, bool, (n,)."""
     out = np.zeros(len(targets), dtype=np.bool_)
     out[0] = True
-    can_reach(targets, slopes, out)
+    can_reach(targets, offsets, possible, out)
     return out

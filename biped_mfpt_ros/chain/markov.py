@@ -1,7 +1,9 @@
 r"""Markov chain over a mesh, and the mean first-passage time to a fall (eq. 29 to 35).
 
 With P(s) the probability of slope s and rho the targets of the mesh, the chain steps from state i
-to rho(i, s) with probability P(s); 0 is the failure state. Q is T without that state, and
+to rho(i, s) with probability P(s); 0 is the failure state. Where slopes are correlated, P(s | r)
+takes the place of P(s), with r the slope before state i, which the states of a clustered mesh
+know: they are a Markov chain all the same. Q is T without the failure state, and
 f_i = sum of P(s) over the slopes on which i falls. lambda_2 is the largest eigenvalue of Q over
 the states that can be reached from x_2: the others belong to no walk. The metastable
 (quasi-stationary) distribution phi is its left eigenvector, phi Q = lambda_2 phi with sum 1.
@@ -38,10 +40,10 @@ from scipy.sparse import csr_array
 from biped_mfpt_ros.chain import iteration
 from biped_mfpt_ros.chain.aggregation import ROUNDS, metastable_distribution, passage_times
 from biped_mfpt_ros.chain.lanes import LANES
-from biped_mfpt_ros.chain.mesh import Mesh, check_transitions, checked_array
+from biped_mfpt_ros.chain.mesh import CHECKED_ROWS, Mesh, check_transitions, checked_array
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import kernel
-from biped_mfpt_ros.walker.terrain import check_slopes
+from biped_mfpt_ros.walker.terrain import check_correlation, check_slopes, spread_given_last
 
 TOLERANCE = 1e-12
 """Relative accuracy aimed at, in the MFPT and in every state's weight."""
@@ -98,34 +100,121 @@ def slope_probabilities(slopes: ArrayLike, mu_s: float, sigma_s: float) -> np.nd
     InputError
         If an argument is not allowed.
     """
+    return _normal(_check_distribution(slopes, mu_s, sigma_s), mu_s, sigma_s)
+
+
+def conditional_probabilities(
+    slopes: ArrayLike, mu_s: float, sigma_s: float, correlation: float
+) -> np.ndarray:
+    r"""Probabilities P(s | r) of the slopes s of a set after each slope r of it.
+
+    For ground whose slopes are a first-order autoregressive process,
+
+    .. math:: s_{k+1} = \mu_s + \rho (s_k - \mu_s) + \sigma_s \sqrt{1 - \rho^2} e_k,
+
+    with e_k independent and standard normal: normal with the mean and standard deviation of
+    `slope_probabilities` in the long run, and with correlation rho^j between slopes j steps apart.
+    Given r, the next slope is normal with mean mu_s + rho (r - mu_s) and the standard deviation
+    sigma_s sqrt(1 - rho^2): it is this that the spacing d_s should not be coarser than, and what
+    `slope_probabilities` says of its errors holds for it. With d_s far above it the slope nearest
+    to that mean gets all.
+
+    Parameters
+    ----------
+    slopes : array_like
+        S of eq. (24), rad, strictly ascending, shape (m,).
+    mu_s : float
+        Mean slope, rad, within the set.
+    sigma_s : float
+        Standard deviation of the slope, rad, above 0.
+    correlation : float
+        rho, of each slope with the one before, above -1 and below 1.
+
+    Returns
+    -------
+    numpy.ndarray
+        float64, shape (m, m): row r is P(. | r), with sum 1.
+
+    Raises
+    ------
+    InputError
+        If an argument is not allowed.
+    """
+    slopes = _check_distribution(slopes, mu_s, sigma_s)
+    correlation = check_correlation(correlation)
+    means = mu_s + correlation * (slopes - mu_s)
+    return _normal(slopes, means[:, np.newaxis], spread_given_last(sigma_s, correlation))
+
+
+def _check_distribution(slopes: ArrayLike, mu_s: float, sigma_s: float) -> np.ndarray:
     slopes = check_slopes(slopes)
     if not (isinstance(mu_s, Real) and slopes[0] <= mu_s <= slopes[-1]):
         raise InputError("mu_s", mu_s, f"{slopes[0]:.6g} to {slopes[-1]:.6g} rad, the slope set")
     if not (isinstance(sigma_s, Real) and math.isfinite(sigma_s) and sigma_s > 0.0):
         raise InputError("sigma_s", sigma_s, "a finite number above 0, rad")
+    return slopes
+
+
+def _normal(slopes: np.ndarray, mean: float | np.ndarray, sigma: float) -> np.ndarray:
+    """The normal density on the slopes, scaled to sum 1 along the last axis."""
     # Relative to the likeliest slope, so that a narrow density between slopes does not vanish.
-    distances = np.abs(slopes - mu_s)
-    least = distances.min()
+    distances = np.abs(slopes - mean)
+    least = distances.min(axis=-1, keepdims=True)
     with np.errstate(over="ignore"):
-        exponents = 0.5 * ((distances - least) * (distances + least)) / sigma_s / sigma_s
+        exponents = 0.5 * ((distances - least) * (distances + least)) / sigma / sigma
     weights = np.exp(-exponents)
-    return weights / weights.sum()
+    return weights / weights.sum(axis=-1, keepdims=True)
 
 
-def _check_chain(targets: ArrayLike, probabilities: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def _check_chain(
+    targets: ArrayLike, probabilities: ArrayLike, preceding: ArrayLike | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Targets, offsets (see `iteration`) and the probability of each class."""
     shape = np.shape(targets)
     if len(shape) != 2 or shape[0] < 2 or shape[1] < 1:
         raise InputError("targets", shape, "an array of shape (n, m), n at least 2, m at least 1")
     targets = checked_array("targets", targets, np.uint32, shape)
     if targets.max() >= shape[0]:
         raise InputError("targets", int(targets.max()), f"indices of states, below {shape[0]}")
-    probabilities = checked_array("probabilities", probabilities, np.float64, shape[1:])
-    if not ((probabilities >= 0.0).all() and abs(probabilities.sum() - 1.0) <= 1e-12):
-        raise InputError("probabilities", probabilities.tolist(), "not negative, with sum 1")
-    return targets, probabilities
+    n, m = shape
+    wanted = (m,) if preceding is None else (m, m)
+    probabilities = checked_array("probabilities", probabilities, np.float64, wanted)
+    if not (
+        (probabilities >= 0.0).all() and (abs(probabilities.sum(axis=-1) - 1.0) <= 1e-12).all()
+    ):
+        allowed = "not negative, with sum 1" if preceding is None else "not negative, rows of sum 1"
+        raise InputError("probabilities", probabilities.tolist(), allowed)
+    if preceding is None:
+        return targets, np.zeros(n, dtype=np.int64), probabilities
+    preceding = checked_array("preceding", preceding, np.uint32, (n,))
+    return targets, _offsets(targets, preceding), probabilities.ravel()
 
 
-def transition_matrix(targets: ArrayLike, probabilities: ArrayLike) -> csr_array:
+def _offsets(targets: np.ndarray, preceding: np.ndarray) -> np.ndarray:
+    """Offsets (see `iteration`) of the states of a chain with correlated slopes.
+
+    Raises
+    ------
+    InputError
+        If a state does not know the slope before it.
+    """
+    n, m = targets.shape
+    if preceding.max() >= m:
+        raise InputError("preceding", int(preceding.max()), f"indices of slopes, below {m}")
+    for first in range(1, n, CHECKED_ROWS):
+        block = targets[first : first + CHECKED_ROWS]
+        wrong = (block != 0) & (preceding[block] != np.arange(m))
+        if wrong.any():
+            i, s = np.argwhere(wrong)[0]
+            j = int(block[i, s])
+            allowed = f"{s}, the slope over which state {first + i} leads to it"
+            raise InputError(f"preceding[{j}]", int(preceding[j]), allowed)
+    return preceding.astype(np.int64) * m
+
+
+def transition_matrix(
+    targets: ArrayLike, probabilities: ArrayLike, preceding: ArrayLike | None = None
+) -> csr_array:
     """Stochastic state-transition matrix T (eq. 32), the failure state included as index 0.
 
     Parameters
@@ -133,7 +222,10 @@ def transition_matrix(targets: ArrayLike, probabilities: ArrayLike) -> csr_array
     targets : array_like
         Eq. (27) as in `Mesh`, shape (n, m).
     probabilities : array_like
-        P_S, shape (m,).
+        P_S, shape (m,); with `preceding` P(s | r), shape (m, m), a row for each r.
+    preceding : array_like, optional
+        As in `Mesh`, shape (n,): index of the slope before each state, where the next slope
+        depends on that.
 
     Returns
     -------
@@ -145,16 +237,19 @@ def transition_matrix(targets: ArrayLike, probabilities: ArrayLike) -> csr_array
     InputError
         If an argument is not allowed.
     """
-    targets, probabilities = _check_chain(targets, probabilities)
-    n = len(targets)
-    columns = np.flatnonzero(probabilities)
-    indices = targets[1:, columns].ravel()
+    return _matrix(*_check_chain(targets, probabilities, preceding))
+
+
+def _matrix(targets: np.ndarray, offsets: np.ndarray, probabilities: np.ndarray) -> csr_array:
+    n, m = targets.shape
+    shares = probabilities.reshape(-1, m)[offsets[1:] // m]
+    kept = shares > 0.0
     # The failure state is absorbing: one entry.
     matrix = csr_array(
         (
-            np.concatenate([[1.0], np.tile(probabilities[columns], n - 1)]),
-            np.concatenate([[0], indices]).astype(np.int64),
-            np.concatenate([[0], 1 + len(columns) * np.arange(n, dtype=np.int64)]),
+            np.concatenate([[1.0], shares[kept]]),
+            np.concatenate([[0], targets[1:][kept]]).astype(np.int64),
+            np.concatenate([[0, 1], 1 + np.cumsum(kept.sum(axis=1))]),
         ),
         shape=(n, n),
     )
@@ -197,6 +292,7 @@ class Metastability:
     distribution: np.ndarray
     failure_shares: dict[int, float]
     _targets: np.ndarray = field(repr=False)
+    _offsets: np.ndarray = field(repr=False)
     _probabilities: np.ndarray = field(repr=False)
 
     @cached_property
@@ -212,19 +308,22 @@ class Metastability:
         ChainError
             If the chain mixes too slowly to be iterated, and aggregation does not settle either.
         """
-        targets, probabilities = self._targets, self._probabilities
-        slopes = np.flatnonzero(probabilities)
-        endless = ~iteration.can_fall(targets, slopes)
-        iteration.can_reach(targets, slopes, endless)
+        targets, offsets, probabilities = self._targets, self._offsets, self._probabilities
+        possible = probabilities > 0.0
+        endless = ~iteration.can_fall(targets, offsets, possible)
+        iteration.can_reach(targets, offsets, possible, endless)
         among = ~endless
         among[0] = False
         escape = 0.0 if endless.any() else self.failure_probability
         members = np.flatnonzero(among)
         times: np.ndarray | None = np.zeros(len(targets))
         if len(members):
-            times = _iterated_times(targets, probabilities, among, self.distribution, escape)
+            times = _iterated_times(
+                targets, offsets, probabilities, among, self.distribution, escape
+            )
         if times is None:
-            found = passage_times(*_restricted(targets, probabilities, members), TOLERANCE)
+            rows = _restricted(targets, offsets, probabilities, members)
+            found = passage_times(*rows, TOLERANCE)
             if found is None:
                 raise ChainError(_unsettled(len(members)))
             times = np.zeros(len(targets))
@@ -236,6 +335,7 @@ class Metastability:
 
 def _iterated_times(
     targets: np.ndarray,
+    offsets: np.ndarray,
     probabilities: np.ndarray,
     among: np.ndarray,
     phi: np.ndarray,
@@ -258,7 +358,7 @@ def _iterated_times(
     psi = np.zeros(n)
     if escape > 0.0:
         settled = iteration.settle(
-            iteration.outgoing(targets, np.flatnonzero(probabilities)),
+            iteration.outgoing(targets, offsets, probabilities > 0.0),
             probabilities[:, np.newaxis],
             np.array([np.argmax(phi)]),
             # Below this, psi / escape is within the tolerance of the first step alone.
@@ -273,7 +373,7 @@ def _iterated_times(
         # 0 where nothing settles at all, and tiny where psi is that of states out of x_2's reach.
         overlap = float(phi @ found)
         if overlap < iteration.UNDERFLOW:
-            return _iterated_times(targets, probabilities, among, phi, 0.0)
+            return _iterated_times(targets, offsets, probabilities, among, phi, 0.0)
         psi = found / overlap
     rest = np.where(among, 1.0 - psi, 0.0)
     first = np.zeros(n)
@@ -286,9 +386,9 @@ def _iterated_times(
         if k * largest <= TOLERANCE:
             times = first + series
             if (first > _CANCELLATION * times).any():
-                return _iterated_times(targets, probabilities, among, phi, 0.0)
+                return _iterated_times(targets, offsets, probabilities, among, phi, 0.0)
             return times
-        iteration.step_backward(targets, probabilities, rest, out)
+        iteration.step_backward(targets, offsets, probabilities, rest, out)
         if k <= iteration.PLAIN_STEPS:
             series += rest
             rest, out = out, rest
@@ -307,20 +407,20 @@ OnProgress = Callable[[int, int, float], object]
 
 
 @kernel
-def _survive(targets, probabilities, rows, x, out):
+def _survive(targets, offsets, probabilities, rows, x, out):
     """out[rows] = probability to get in one step where x counts, for a function x of the state."""
     for k in range(rows.shape[0]):
         total = 0.0
         for s in range(targets.shape[1]):
-            total += probabilities[s] * x[targets[rows[k], s]]
+            total += probabilities[offsets[rows[k]] + s] * x[targets[rows[k], s]]
         out[rows[k]] = total
 
 
 def _restricted(
-    targets: np.ndarray, probabilities: np.ndarray, members: np.ndarray
+    targets: np.ndarray, offsets: np.ndarray, probabilities: np.ndarray, members: np.ndarray
 ) -> tuple[csr_array, np.ndarray]:
     """Q among some states, which lead only to each other and to 0, and what falls from them."""
-    rows = transition_matrix(targets, probabilities)[members]
+    rows = _matrix(targets, offsets, probabilities)[members]
     return csr_array(rows[:, members]), rows[:, [0]].toarray().ravel()
 
 
@@ -332,31 +432,40 @@ def _unsettled(states: int) -> str:
 
 
 class _Solver:
-    """Chains over one mesh that differ in the probabilities of the slopes, by column."""
+    """Chains over one mesh that differ in the probabilities of the classes, by column."""
 
     def __init__(
-        self, targets: np.ndarray, outcomes: np.ndarray, probabilities: np.ndarray
+        self,
+        targets: np.ndarray,
+        outcomes: np.ndarray,
+        offsets: np.ndarray,
+        probabilities: np.ndarray,
     ) -> None:
         self.targets = targets
         self.outcomes = outcomes
+        self.offsets = offsets
         self.probabilities = probabilities
-        # All slopes, also those without probability, so that sums are in the same order whatever
+        # All classes, also those without probability, so that sums are in the same order whatever
         # the columns.
-        self.structure = iteration.incoming(targets, np.arange(targets.shape[1]))
-        # Where a slope has no probability at all, others can be reached, or no fall.
-        self.slopes = [np.flatnonzero(p) for p in probabilities.T]
+        every = np.ones(len(probabilities), dtype=np.bool_)
+        self.structure = iteration.incoming(targets, offsets, every)
+        # Where a class has no probability at all, others can be reached, or no fall.
+        self.possible = np.ascontiguousarray(probabilities.T > 0.0)
         known: dict[bytes, int] = {}
-        for slopes in self.slopes:
-            if slopes.tobytes() not in known:
-                known[slopes.tobytes()] = self._safe(slopes)
-        self.safe = np.array([known[slopes.tobytes()] for slopes in self.slopes])
+        for possible in self.possible:
+            if possible.tobytes() not in known:
+                known[possible.tobytes()] = self._safe(possible)
+        self.safe = np.array([known[possible.tobytes()] for possible in self.possible])
 
-    def _safe(self, slopes: np.ndarray) -> int:
+    def _reachable(self, possible: np.ndarray, start: int) -> np.ndarray:
+        return iteration.reachable(self.targets, self.offsets, possible, start)
+
+    def _safe(self, possible: np.ndarray) -> int:
         """A state that can be reached from x_2 and from which no fall can; 0: there is none."""
-        can_fall = iteration.can_fall(self.targets, slopes)
+        can_fall = iteration.can_fall(self.targets, self.offsets, possible)
         if can_fall.all():
             return 0
-        return int(np.argmax(iteration.reachable(self.targets, slopes, 1) & ~can_fall))
+        return int(np.argmax(self._reachable(possible, 1) & ~can_fall))
 
     def iterate(
         self, columns: np.ndarray, begin: np.ndarray, on_steps: iteration.OnSteps | None
@@ -366,7 +475,7 @@ class _Solver:
         p = np.zeros((len(self.probabilities), width))
         p[:, : len(columns)] = self.probabilities[:, columns]
         weights = np.zeros((n, width))
-        iteration.fall_probabilities(self.targets, p, weights)
+        iteration.fall_probabilities(self.targets, self.offsets, p, weights)
         weights[:, np.flatnonzero(self.safe[columns])] = 1.0
         factors = np.full(width, TOLERANCE / n)
         return iteration.settle(
@@ -427,9 +536,8 @@ class _Solver:
         """
         if begin == 1 or self.safe[column]:
             return None
-        slopes, p = self.slopes[column], self.probabilities[:, column]
-        aside = iteration.reachable(self.targets, slopes, 1)
-        aside &= ~iteration.reachable(self.targets, slopes, begin)
+        possible, p = self.possible[column], self.probabilities[:, column]
+        aside = self._reachable(possible, 1) & ~self._reachable(possible, begin)
         rows = np.flatnonzero(aside)
         if not len(rows):
             return None
@@ -437,7 +545,7 @@ class _Solver:
         lambda_2 = survives[0]
         x, out = aside.astype(np.float64), np.zeros(len(phi))
         for _ in range(_ASIDE_STEPS if lambda_2 > 0.0 else 0):
-            _survive(self.targets, p, rows, x, out)
+            _survive(self.targets, self.offsets, p, rows, x, out)
             # Beyond 1 a bound does not hide an eigenvector, of which x is never less than a copy.
             with np.errstate(over="ignore"):
                 np.minimum(out / lambda_2, _MOST_SURVIVAL, out=out)
@@ -450,9 +558,10 @@ class _Solver:
 
     def _aggregated(self, column: int) -> np.ndarray:
         """Metastable distribution of one column, however slowly it mixes."""
-        members = iteration.reachable(self.targets, self.slopes[column], max(1, self.safe[column]))
+        members = self._reachable(self.possible[column], max(1, self.safe[column]))
         members[0] = False
-        rows = _restricted(self.targets, self.probabilities[:, column], np.flatnonzero(members))
+        p = self.probabilities[:, column]
+        rows = _restricted(self.targets, self.offsets, p, np.flatnonzero(members))
         phi = metastable_distribution(*rows, TOLERANCE)
         if phi is None:
             raise ChainError(_unsettled(len(rows[1])))
@@ -465,7 +574,7 @@ class _Solver:
         by_code = np.zeros((int(self.outcomes[1:].max()) + 1, len(columns)))
         survives = np.zeros(len(columns))
         p = np.ascontiguousarray(self.probabilities[:, columns])
-        iteration.account(self.targets, self.outcomes, p, phi, by_code, survives)
+        iteration.account(self.targets, self.outcomes, self.offsets, p, phi, by_code, survives)
         return by_code, survives
 
     def solve(
@@ -494,6 +603,7 @@ class _Solver:
                         for code in by_code[:, c].nonzero()[0]
                     },
                     _targets=self.targets,
+                    _offsets=self.offsets,
                     _probabilities=self.probabilities[:, column].copy(),
                 )
             )
@@ -503,12 +613,13 @@ class _Solver:
 def _solve(
     targets: np.ndarray,
     outcomes: np.ndarray,
+    offsets: np.ndarray,
     probabilities: np.ndarray,
     threads: int | None = None,
     on_progress: OnProgress | None = None,
 ) -> list[Metastability | ChainError]:
-    """Metastability for each column of `probabilities`, shape (m, columns)."""
-    solver = _Solver(targets, outcomes, probabilities)
+    """Metastability for each column of `probabilities`, shape (classes, columns)."""
+    solver = _Solver(targets, outcomes, offsets, probabilities)
     count = probabilities.shape[1]
     work = count * len(solver.structure.entries)
     threads = (threads or os.cpu_count() or 1) if work >= _WORTH_THREADS else 1
@@ -540,11 +651,11 @@ def _solve(
         pool.shutdown(cancel_futures=True)
 
 
-def _one(targets: np.ndarray, outcomes: np.ndarray, probabilities: np.ndarray) -> Metastability:
-    (found,) = _solve(targets, outcomes, np.ascontiguousarray(probabilities[:, np.newaxis]))
-    if isinstance(found, ChainError):
-        raise found
-    return found
+def _the_one(found: list[Metastability | ChainError]) -> Metastability:
+    (one,) = found
+    if isinstance(one, ChainError):
+        raise one
+    return one
 
 
 def metastabilities(
@@ -552,6 +663,7 @@ def metastabilities(
     mu_s: float,
     sigma_s: Sequence[float] | np.ndarray,
     *,
+    correlation: float = 0.0,
     threads: int | None = None,
     on_progress: OnProgress | None = None,
 ) -> list[Metastability | ChainError]:
@@ -569,6 +681,9 @@ def metastabilities(
     sigma_s : sequence of float
         Standard deviations of the slope, rad, above 0. The slope set should not be much coarser,
         see `slope_probabilities`.
+    correlation : float, optional
+        Of each slope with the one before, above -1 and below 1; see `conditional_probabilities`.
+        Other than 0 the mesh has to be clustered: else its states do not tell the slope before.
     threads : int, optional
         Most threads; default one for each core. A small chain takes one.
     on_progress : callable, optional
@@ -586,22 +701,36 @@ def metastabilities(
     Raises
     ------
     InputError
-        If mu_s or one of sigma_s is not allowed.
+        If mu_s, one of sigma_s, or correlation is not allowed.
     """
+    offsets = np.zeros(len(mesh.targets), dtype=np.int64)
+    if check_correlation(correlation) != 0.0:
+        if not mesh.clustered:
+            raise InputError(
+                "correlation", correlation, "0 on this mesh, as it was grown with clustered = "
+                "False: its states do not tell the slope before them"
+            )  # fmt: skip
+        offsets = _offsets(mesh.targets, mesh.preceding)
     columns = []
     for i, sigma in enumerate(sigma_s):
         try:
-            columns.append(slope_probabilities(mesh.slopes, mu_s, sigma))
+            if correlation == 0.0:
+                columns.append(slope_probabilities(mesh.slopes, mu_s, sigma))
+            else:
+                rows = conditional_probabilities(mesh.slopes, mu_s, sigma, correlation)
+                columns.append(rows.ravel())
         except InputError as error:
             field = f"sigma_s[{i}]" if error.field == "sigma_s" else error.field
             raise InputError(field, error.value, error.allowed) from None
     if not columns:
         return []
     probabilities = np.ascontiguousarray(np.array(columns).T)
-    return _solve(mesh.targets, mesh.outcomes, probabilities, threads, on_progress)
+    return _solve(mesh.targets, mesh.outcomes, offsets, probabilities, threads, on_progress)
 
 
-def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
+def metastability(
+    mesh: Mesh, mu_s: float, sigma_s: float, correlation: float = 0.0
+) -> Metastability:
     """Metastability of the chain over a mesh for normally distributed slopes (eq. 30 to 35).
 
     Parameters
@@ -613,6 +742,8 @@ def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
     sigma_s : float
         Standard deviation of the slope, rad, above 0. The slope set should not be much coarser,
         see `slope_probabilities`.
+    correlation : float, optional
+        As for `metastabilities`.
 
     Returns
     -------
@@ -621,15 +752,22 @@ def metastability(mesh: Mesh, mu_s: float, sigma_s: float) -> Metastability:
     Raises
     ------
     InputError
-        If mu_s or sigma_s is not allowed.
+        If mu_s, sigma_s or correlation is not allowed.
     ChainError
         If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
-    probabilities = slope_probabilities(mesh.slopes, mu_s, sigma_s)
-    return _one(mesh.targets, mesh.outcomes, probabilities)
+    try:
+        return _the_one(metastabilities(mesh, mu_s, [sigma_s], correlation=correlation))
+    except InputError as error:
+        raise InputError(error.field.removesuffix("[0]"), error.value, error.allowed) from None
 
 
-def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLike) -> Metastability:
+def solve_chain(
+    targets: ArrayLike,
+    outcomes: ArrayLike,
+    probabilities: ArrayLike,
+    preceding: ArrayLike | None = None,
+) -> Metastability:
     """Metastability of a chain given by its arrays, for any distribution of slopes.
 
     Parameters
@@ -637,7 +775,11 @@ def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLik
     targets, outcomes : array_like
         As in `Mesh`, shape (n, m). The walk starts in state 1.
     probabilities : array_like
-        P_S, not negative, sum 1, shape (m,).
+        P_S, not negative, sum 1, shape (m,); with `preceding` P(s | r), a row of this kind for
+        each r, shape (m, m).
+    preceding : array_like, optional
+        As in `Mesh`, shape (n,): index of the slope before each state, where the next slope
+        depends on that. A state that is reached over two slopes does not know it.
 
     Returns
     -------
@@ -650,7 +792,7 @@ def solve_chain(targets: ArrayLike, outcomes: ArrayLike, probabilities: ArrayLik
     ChainError
         If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
     """
-    targets, probabilities = _check_chain(targets, probabilities)
+    targets, offsets, probabilities = _check_chain(targets, probabilities, preceding)
     outcomes = checked_array("outcomes", outcomes, np.uint8, targets.shape)
     check_transitions(targets, outcomes)
-    return _one(targets, outcomes, probabilities)
+    return _the_one(_solve(targets, outcomes, offsets, probabilities[:, np.newaxis].copy()))

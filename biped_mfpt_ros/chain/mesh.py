@@ -60,7 +60,9 @@ SCALE_REFRESHES = ("generation", "addition")
 # good to 1e-6 or so: nothing that is still to be told apart lies below.
 _ROUNDING = 1e-12
 
-_CHECKED_ROWS = 4096
+CHECKED_ROWS = 4096
+"""Rows of a mesh that are checked at a time: what that takes is to be little beside the mesh."""
+
 _WORTH_THREADS = 2000  # states
 
 
@@ -293,9 +295,8 @@ def check_transitions(targets: np.ndarray, outcomes: np.ndarray) -> None:
             (targets[0].tolist(), outcomes[0].tolist()),
             f"all 0 and all {NOT_SIMULATED}: the failure state takes no step",
         )
-    # By blocks: the truth values of a large mesh would take as much as the mesh.
-    for first in range(1, n, _CHECKED_ROWS):
-        block = slice(first, first + _CHECKED_ROWS)
+    for first in range(1, n, CHECKED_ROWS):
+        block = slice(first, first + CHECKED_ROWS)
         wrong = (targets[block] == 0) == (outcomes[block] == _STEP)
         if wrong.any():
             i, s = np.argwhere(wrong)[0]

@@ -23,7 +23,7 @@ from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
-from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, check_correlation, deviations
 
 _BLOCK_WALKS = 64  # walks in a job: some ten milliseconds of work
 _STEP = int(Outcome.STEP)
@@ -148,6 +148,7 @@ def monte_carlo(
     seed: int,
     *,
     mu_s: float = 0.0,
+    correlation: float = 0.0,
     model: WalkerModel | None = None,
     state: ArrayLike | None = None,
     max_steps: int = 10_000,
@@ -171,6 +172,11 @@ def monte_carlo(
         Of all walks, >= 0.
     mu_s : float, optional
         rad, mean slope.
+    correlation : float, optional
+        Of each slope with the one before, above -1 and below 1; see `terrain.deviations`. The
+        slope before the first one is that of the flat ground on which the walk starts, 0, also
+        where the mean is another: the first slope has the mean (1 - correlation) mu_s. So it is
+        in a chain over a mesh, whose first state follows flat ground, too.
     model : WalkerModel, optional
         Torque limit, friction and so on.
     state : array_like, optional
@@ -186,7 +192,8 @@ def monte_carlo(
     Returns
     -------
     MonteCarlo
-        Steps and falls. Slopes beyond those that can be simulated (45 degrees) are cut to them.
+        Steps and falls. Slopes beyond those that can be simulated (45 degrees) are cut to them,
+        which changes nothing in those that follow.
 
     Raises
     ------
@@ -200,6 +207,7 @@ def monte_carlo(
         raise InputError("sigma_s", sigma_s, "finite, > 0 rad")
     if not abs(mu_s) <= SLOPE_LIMIT:
         raise InputError("mu_s", mu_s, f"within {SLOPE_LIMIT:.4f} rad")
+    check_correlation(correlation)
     for name, value in (("walks", walks), ("max_steps", max_steps)):
         if value < 1:
             raise InputError(name, value, ">= 1")
@@ -212,6 +220,7 @@ def monte_carlo(
     packed_model, packed_controller = model.packed(), controller.packed(model.robot)
     states = np.tile(start, (walks, 1))
     previous = np.zeros(walks)
+    before = previous - mu_s
     steps = np.zeros(walks, dtype=np.int64)
     outcomes = np.zeros(walks, dtype=np.uint8)
 
@@ -227,7 +236,9 @@ def monte_carlo(
                 break
             walkers = block[upright]
             draws = np.array([randoms[n].standard_normal(length) for n in upright])
-            slopes = np.clip(mu_s + sigma_s * draws, -SLOPE_LIMIT, SLOPE_LIMIT)
+            off = deviations(draws, before[walkers], sigma_s, correlation)
+            before[walkers] = off[:, -1]
+            slopes = np.clip(mu_s + off, -SLOPE_LIMIT, SLOPE_LIMIT)
             s, p = states[walkers], previous[walkers]
             k, o = np.zeros(walkers.size, dtype=np.int64), np.zeros(walkers.size, dtype=np.uint8)
             _walk(controller.code, packed_model, packed_controller, s, p, slopes, k, o)

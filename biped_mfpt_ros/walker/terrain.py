@@ -1,8 +1,9 @@
-"""Slopes: the set of eq. (24), and what slopes are allowed."""
+"""Slopes: the set of eq. (24), what slopes are allowed, and random ground."""
 
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -77,4 +78,55 @@ def check_slopes(slopes: ArrayLike, field: str = "slopes") -> np.ndarray:
             float(out[1:][descends][0]),
             "strictly ascending slopes",
         )
+    return out
+
+
+def check_correlation(correlation: float) -> float:
+    """Check the correlation of successive slopes, above -1 and below 1.
+
+    Raises
+    ------
+    InputError
+        If it is not.
+    """
+    if not (isinstance(correlation, Real) and -1.0 < correlation < 1.0):
+        raise InputError("correlation", correlation, "a number above -1 and below 1")
+    return float(correlation)
+
+
+def spread_given_last(sigma_s: float, correlation: float) -> float:
+    """Standard deviation of the slope when the one before is known, rad; of all slopes sigma_s."""
+    return sigma_s * math.sqrt((1.0 - correlation) * (1.0 + correlation))
+
+
+def deviations(
+    draws: np.ndarray, before: ArrayLike, sigma_s: float, correlation: float
+) -> np.ndarray:
+    r"""Deviations of successive slopes from their mean: a first-order autoregressive process.
+
+    .. math:: d_k = \rho d_{k-1} + \sigma \sqrt{1 - \rho^2} e_k
+
+    whose marginal distribution is N(0, sigma^2) for any correlation.
+
+    Parameters
+    ----------
+    draws : numpy.ndarray
+        e_k, standard normal, shape (..., k).
+    before : array_like
+        rad, deviation of the slope before the first of these, shape (...).
+    sigma_s : float
+        rad, standard deviation of the slope.
+    correlation : float
+        rho, of each slope with the one before, -1 < rho < 1.
+
+    Returns
+    -------
+    numpy.ndarray
+        rad, shape (..., k).
+    """
+    out = spread_given_last(sigma_s, correlation) * draws
+    if correlation != 0.0:
+        for k in range(out.shape[-1]):
+            out[..., k] += correlation * np.asarray(before)
+            before = out[..., k]
     return out
