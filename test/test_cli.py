@@ -21,7 +21,8 @@ from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.parser import make_parser
 from biped_mfpt_ros.cli.processes import Processes, Stopped
-from biped_mfpt_ros.control.controller import controller_names
+from biped_mfpt_ros.control.controller import controller, controller_names
+from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.walker.robot import WalkerModel
 
 # On the limit cycle of hzd/base.
@@ -68,7 +69,6 @@ class TestInProcess:
         assert result["energy"] > 0.0
 
     def test_step_equals_the_core(self, capsys):
-        from biped_mfpt_ros.control.controller import controller
         from biped_mfpt_ros.gait.step import simulate_steps
 
         result = run_json(
@@ -142,6 +142,14 @@ class TestInProcess:
         other = run_json(capsys, *arguments, "--seed", "2")
         assert again["mean_steps"] == result["mean_steps"] != other["mean_steps"]
 
+    def test_monte_carlo_on_correlated_ground(self, capsys):
+        arguments = ("monte-carlo", "--controller", "hzd/cot", "--sigma", "2", "--walks", "50")
+        result = run_json(capsys, *arguments, "--correlation", "-0.5")
+        expected = monte_carlo(controller("hzd/cot"), math.radians(2.0), 50, 1, correlation=-0.5)
+        assert result["correlation"] == -0.5
+        assert result["mean_steps"] == expected.mean_steps
+        assert result["paper"] is None
+
     def test_controllers(self, capsys):
         result = run_json(capsys, "controllers")
         names = [row["controller"] for row in result["controllers"]]
@@ -171,6 +179,21 @@ class TestBadInput:
             (["monte-carlo", "--sigma", "-2"], "--sigma", "-2"),
             (["monte-carlo", "--sigma", "inf"], "--sigma", "inf"),
             (["monte-carlo", "--sigma", "two"], "--sigma", "two"),
+            (["monte-carlo", "--sigma", "2", "--correlation", "-1"], "--correlation", "-1.0"),
+            (["mfpt", "--sigma", "1", "--correlation", "nan"], "--correlation", "nan"),
+            (
+                ["mfpt", "--sigma", "1", "--unclustered", "--correlation", "0.5"],
+                "--correlation",
+                "0.5",
+            ),
+            (["run", "--correlation", "1"], "--correlation", "1.0"),
+            (["inspect", "bag", "--correlation", "0.5"], "--sigma", "None"),
+            (["optimise", "--local", "--correlation", "2"], "--correlation", "2.0"),
+            (
+                ["picture", "falls", "--output", "x.png", "--correlation", "1"],
+                "--correlation",
+                "1.0",
+            ),
             (["monte-carlo", "--sigma", "2", "--walks", "0"], "--walks", "0"),
             (["monte-carlo", "--sigma", "2", "--walks", "1.5"], "--walks", "1.5"),
             (["monte-carlo", "--sigma", "2", "--seed", "-1"], "--seed", "-1"),
@@ -325,7 +348,6 @@ class TestMesh:
     def test_equals_the_core(self, capsys):
         from biped_mfpt_ros.chain.markov import metastability
         from biped_mfpt_ros.chain.mesh import grow_mesh
-        from biped_mfpt_ros.control.controller import controller
         from biped_mfpt_ros.gait.cycle import find_limit_cycle
         from biped_mfpt_ros.gait.step import simulate_steps
         from biped_mfpt_ros.walker.terrain import slope_set
@@ -348,6 +370,34 @@ class TestMesh:
         expected = metastability(mesh, math.radians(-0.5), math.radians(1.5))
         assert result["states"] == len(mesh.states)
         assert result["estimates"][0]["mfpt"] == expected.mfpt
+
+    def test_correlated_ground(self, capsys):
+        from biped_mfpt_ros.chain.markov import metastability
+        from biped_mfpt_ros.chain.mesh import grow_mesh
+        from biped_mfpt_ros.gait.cycle import find_limit_cycle
+        from biped_mfpt_ros.gait.step import simulate_steps
+        from biped_mfpt_ros.walker.terrain import slope_set
+
+        result = run_json(
+            capsys,
+            "mfpt",
+            *self.ARGUMENTS,
+            "--sigma",
+            "1",
+            "--mean",
+            "-0.5",
+            "--correlation",
+            "0.6",
+        )
+        walking, slopes = controller("hzd/cot"), slope_set(0.5)
+        mesh = grow_mesh(
+            lambda states, previous: simulate_steps(walking, states, previous, slopes),
+            find_limit_cycle(walking).state, slopes, 0.3,
+        )  # fmt: skip
+        expected = metastability(mesh, math.radians(-0.5), math.radians(1.0), 0.6)
+        assert result["correlation"] == 0.6
+        assert result["estimates"][0]["mfpt"] == expected.mfpt
+        assert result["estimates"][0]["paper"] is None
 
     def test_mesh_in_a_file(self, capsys, tmp_path):
         path = tmp_path / "mesh.of.cot"

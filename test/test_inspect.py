@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from biped_mfpt_msgs import msg as messages
 from rclpy.serialization import serialize_message
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_bag import QOS, add_topic, stated_hash
 
 from biped_mfpt_ros.bag import BagError, BagWriter, inspect_bag, read_meshes, salvage
@@ -55,7 +57,9 @@ def mesh() -> Mesh:
 class Recording:
     """What a recorder would have heard of a mesh, to be spoilt before it is written."""
 
-    def __init__(self, mesh: Mesh, mesh_id: str = "mesh-1", sigmas=SIGMAS, patience=40):
+    def __init__(
+        self, mesh: Mesh, mesh_id: str = "mesh-1", sigmas=SIGMAS, patience=40, correlations=(0.0,)
+    ):
         def info(status, **fields):
             return messages.MeshInfo(
                 mesh_id=mesh_id, status=status, step_map="1+abc", seconds=2.5,
@@ -89,8 +93,16 @@ class Recording:
         ]
         self.mfpt = [
             conversion.estimate_message(
-                mesh_id, "hzd/base", mesh, 0.0, sigma, metastability(mesh, 0.0, sigma), 0.01
+                mesh_id,
+                "hzd/base",
+                mesh,
+                0.0,
+                sigma,
+                rho,
+                metastability(mesh, 0.0, sigma, rho),
+                0.01,
             )
+            for rho in correlations
             for sigma in sigmas
         ]
         for topic in (self.info, self.states, self.transitions, self.mfpt):
@@ -186,6 +198,49 @@ def test_report_for_other_distributions(tmp_path, mesh):
                               ([0.1], 1.0, "mu_s")):  # fmt: skip
         with pytest.raises(InputError, match=field):
             inspect_bag(bag, sigmas, mu)
+
+
+def test_report_for_correlated_ground(tmp_path, mesh):
+    bag = Recording(mesh, correlations=(0.0, -0.5)).write(tmp_path / "bag")
+    report = inspect_bag(bag)
+    assert report.identical
+    (found,) = report.meshes
+    assert [(e.sigma_s, e.correlation) for e in found.estimates] == [
+        (sigma, rho) for rho in (0.0, -0.5) for sigma in SIGMAS
+    ]
+    (found,) = inspect_bag(bag, [SIGMAS[0]], correlation=-0.5).meshes
+    assert found.estimates[0].identical
+    (found,) = inspect_bag(bag, [SIGMAS[0]], -0.02, 0.7).meshes
+    assert found.estimates[0].published is None
+    assert found.estimates[0].mfpt == metastability(mesh, -0.02, SIGMAS[0], 0.7).mfpt
+    with pytest.raises(InputError, match=r"^correlation: "):
+        inspect_bag(bag, [SIGMAS[0]], correlation=1.0)
+
+
+def test_estimates_that_know_no_correlation_are_of_independent_slopes(tmp_path, mesh):
+    name = "biped_mfpt_msgs/msg/MfptEstimate"
+    text = message_definition(name)
+    older = re.sub(r"float64 correlation.*\n", "", text)
+    stores = [get_typestore(Stores.EMPTY) for _ in range(2)]
+    for store, definition in zip(stores, (text, older), strict=True):
+        store.register(get_types_from_msg(definition, name))
+    recording = Recording(mesh)
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/mfpt", name, older)
+        for message in recording.mfpt:
+            fields = vars(stores[0].deserialize_cdr(serialize_message(message), name))
+            kept = {key: fields[key] for key in fields if key not in ("correlation", "__msgtype__")}
+            old = stores[1].types[name](**kept)
+            writer.write("/mfpt", bytes(stores[1].serialize_cdr(old, name)), 0, 0)
+        for kind in ("info", "states", "transitions"):
+            add_topic(writer, f"/mesh/{kind}", f"Mesh{kind.capitalize()}")
+            for message in getattr(recording, kind):
+                writer.write(f"/mesh/{kind}", serialize_message(message), 0, 0)
+    report = inspect_bag(tmp_path / "bag")
+    assert report.problems == []
+    assert [(e.correlation, e.identical) for e in report.meshes[0].estimates] == [
+        (0.0, True) for _ in SIGMAS
+    ]
 
 
 def test_other_number_than_published_is_reported(tmp_path, mesh):

@@ -482,8 +482,8 @@ def test_mesh_ids_are_unique_and_plain():
 # Analysis ----------------------------------------------------------------------------------------
 
 
-def same_estimate(estimate, mesh, mu_s, sigma_s):
-    here = metastability(mesh, mu_s, sigma_s)
+def same_estimate(estimate, mesh, mu_s, sigma_s, correlation=0.0):
+    here = metastability(mesh, mu_s, sigma_s, correlation)
     assert estimate.mfpt == here.mfpt
     assert estimate.lambda_2 == here.lambda_2
     assert estimate.failure_probability == here.failure_probability
@@ -493,6 +493,7 @@ def same_estimate(estimate, mesh, mu_s, sigma_s):
     assert estimate.states == len(mesh.states)
     assert estimate.controller == "hzd/base"
     assert (estimate.mu_s, estimate.sigma_s) == (mu_s, sigma_s)
+    assert estimate.correlation == correlation
 
 
 def test_analysis_publishes_also_when_it_starts_late(graph, tester, mesh_here):
@@ -505,13 +506,12 @@ def test_analysis_publishes_also_when_it_starts_late(graph, tester, mesh_here):
     _, result = tester.grow(settings())
     wait_for(lambda: len(estimates) == 2, "estimates")
     graph.stop(early)
-    late = graph.start(Analysis, mu_s_deg=-1.0)
+    late = graph.start(Analysis, mu_s_deg=-1.0, correlation=0.5)
     wait_for(lambda: len(estimates) == 4, "estimates of the late one")
-    for estimate, (mu_deg, sigma_deg) in zip(
-        estimates, [(0.0, 1.0), (0.0, 1.5), (-1.0, 1.0), (-1.0, 2.0)], strict=True
-    ):
+    grounds = [(0.0, 1.0, 0.0), (0.0, 1.5, 0.0), (-1.0, 1.0, 0.5), (-1.0, 2.0, 0.5)]
+    for estimate, (mu_deg, sigma_deg, rho) in zip(estimates, grounds, strict=True):
         assert estimate.mesh_id == result.mesh_id
-        same_estimate(estimate, mesh_here, math.radians(mu_deg), math.radians(sigma_deg))
+        same_estimate(estimate, mesh_here, math.radians(mu_deg), math.radians(sigma_deg), rho)
     assert [estimate.sequence for estimate in estimates] == [0, 1, 0, 1]
     # Estimates are latched, too.
     again = []
@@ -562,8 +562,13 @@ class Publisher(Node):
                     self._topics[kind].publish(message)
 
 
-def ask(mesh_id="", mu_s=0.0, sigma_s=(0.02,)):
-    return ComputeMfpt.Request(mesh_id=mesh_id, mu_s=mu_s, sigma_s=packed(np.array(sigma_s), "d"))
+def ask(mesh_id="", mu_s=0.0, sigma_s=(0.02,), correlation=0.0):
+    return ComputeMfpt.Request(
+        mesh_id=mesh_id,
+        mu_s=mu_s,
+        sigma_s=packed(np.array(sigma_s), "d"),
+        correlation=correlation,
+    )
 
 
 def test_compute_mfpt(graph, tester, mesh_here):
@@ -577,12 +582,12 @@ def test_compute_mfpt(graph, tester, mesh_here):
         publisher.publish(mesh_here, mesh_id)
     wait_for(lambda: compute(ask("c")).success, "the mesh")
     sigmas = (0.01, 0.02, 0.05)
-    for mesh_id in ("b", "c", ""):
-        response = compute(ask(mesh_id, 0.01, sigmas))
+    for mesh_id, rho in (("b", 0.0), ("c", -0.5), ("", 0.8)):
+        response = compute(ask(mesh_id, 0.01, sigmas, rho))
         assert response.success, response.message
         for estimate, sigma_s in zip(response.estimates, sigmas, strict=True):
             assert estimate.mesh_id == (mesh_id or "c")
-            same_estimate(estimate, mesh_here, 0.01, sigma_s)
+            same_estimate(estimate, mesh_here, 0.01, sigma_s, rho)
     forgotten = compute(ask("a"))
     assert not forgotten.success
     assert "only the last 2 meshes are kept" in forgotten.message
@@ -647,6 +652,8 @@ class TestBadQuestions:
             (ask(sigma_s=(math.nan,)), ("sigma_s[0]", "nan", "finite")),
             (ask(mu_s=1.0), ("mu_s", "1.0", "slope set")),
             (ask(mu_s=math.nan), ("mu_s", "nan", "slope set")),
+            (ask(correlation=1.0), ("correlation", "1.0", "above -1 and below 1")),
+            (ask(correlation=math.nan), ("correlation", "nan", "above -1 and below 1")),
         ],
     )
     def test_compute_mfpt_refuses_bad_requests_and_lives_on(self, compute, bad, names):

@@ -11,7 +11,11 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from biped_mfpt_ros.chain.markov import metastability, slope_probabilities
+from biped_mfpt_ros.chain.markov import (
+    conditional_probabilities,
+    metastability,
+    slope_probabilities,
+)
 from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh, grow_mesh
 from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.control.controller import controller
@@ -109,10 +113,11 @@ def offsets(axes):
 
 
 class TestRoughWalk:
-    def test_is_a_walk_of_monte_carlo(self, cycle):
-        expected = monte_carlo(HZD, SIGMA, 6, 5, state=cycle.state, threads=1)
+    @pytest.mark.parametrize("ground", [{}, {"mu_s": 0.004, "correlation": -0.6}])
+    def test_is_a_walk_of_monte_carlo(self, cycle, ground):
+        expected = monte_carlo(HZD, SIGMA, 6, 5, **ground, state=cycle.state, threads=1)
         for number in range(6):
-            found = gaits.rough_walk(HZD, SIGMA, seed=5, number=number, state=cycle.state)
+            found = gaits.rough_walk(HZD, SIGMA, seed=5, number=number, **ground, state=cycle.state)
             assert found.steps == expected.steps[number]
             assert found.outcome == expected.outcomes[number]
 
@@ -327,6 +332,22 @@ class TestMeshPictures:
             assert falls.sum() == pytest.approx(found.failure_probability, rel=1e-12)
             for code, share in found.failure_shares.items():
                 assert falls[code - 1] / falls.sum() == pytest.approx(share, rel=1e-12)
+
+    def test_falls_add_up_on_correlated_ground(self, mesh, drawn):
+        found = metastability(mesh, 0.0, SIGMA, 0.5)
+        rows = conditional_probabilities(mesh.slopes, 0.0, SIGMA, 0.5)[mesh.preceding[1:]]
+        by_slope = mesh_pictures.falls_by_slope(mesh, found.distribution, rows)
+        np.testing.assert_allclose(by_slope.sum(axis=0), 1.0, rtol=1e-12)
+        before = mesh_pictures.falls_by_slope_before(mesh, found.distribution, rows)
+        ahead = found.distribution[1:] @ rows
+        for falls in ((by_slope @ ahead)[1:], before.sum(axis=1)):
+            assert falls.sum() == pytest.approx(found.failure_probability, rel=1e-12)
+            for code, share in found.failure_shares.items():
+                assert falls[code - 1] / falls.sum() == pytest.approx(share, rel=1e-12)
+        picture = mesh_pictures.where_it_falls(mesh, found, 0.0, SIGMA, NAME, 0.5)
+        assert "°, correlation 0.5, when" in picture.caption
+        values, _, _ = drawn[0].axes[0].patches[0].get_data()
+        np.testing.assert_allclose(values, 1.0 - by_slope[0], rtol=1e-9)
 
     def test_falls_by_slope_before(self):
         mesh = small_mesh([[0, 2], [5, 2]], np.zeros((3, 10)))

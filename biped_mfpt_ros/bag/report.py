@@ -63,6 +63,8 @@ class EstimateReport:
     ----------
     mu_s, sigma_s : float
         rad, mean and standard deviation of the slope.
+    correlation : float
+        Of each slope with the one before.
     mfpt : float
         Steps, eq. (35).
     failure_probability, lambda_2 : float
@@ -77,6 +79,7 @@ class EstimateReport:
 
     mu_s: float
     sigma_s: float
+    correlation: float
     mfpt: float
     failure_probability: float
     lambda_2: float
@@ -182,7 +185,10 @@ class BagReport:
 
 
 def inspect_bag(
-    path: str | os.PathLike[str], sigmas: Sequence[float] | None = None, mu: float | None = None
+    path: str | os.PathLike[str],
+    sigmas: Sequence[float] | None = None,
+    mu: float | None = None,
+    correlation: float | None = None,
 ) -> BagReport:
     """Rebuild the meshes of a bag and compute their MFPT, from the bag alone.
 
@@ -195,6 +201,8 @@ def inspect_bag(
         rad, standard deviations of the slope; those that were published with the mesh by default.
     mu : float, optional
         rad, mean slope to go with `sigmas`; 0 by default.
+    correlation : float, optional
+        Of each slope with the one before, to go with `sigmas`; 0 by default.
 
     Returns
     -------
@@ -205,12 +213,11 @@ def inspect_bag(
     BagError
         The bag is missing, cut off, damaged, of another format, or holds no mesh.
     InputError
-        `sigmas` or `mu` are not allowed.
+        `sigmas`, `mu` or `correlation` are not allowed.
     """
     wanted = None
-    if sigmas is not None or mu is not None:
-        mean = 0.0 if mu is None else float(mu)
-        wanted = [(mean, float(sigma)) for sigma in sigmas or ()]
+    if sigmas is not None or mu is not None or correlation is not None:
+        wanted = [(float(mu or 0.0), float(s), float(correlation or 0.0)) for s in sigmas or ()]
     bag = Bag(path)
     checks, published, first, last, problems = _survey(bag)
     topics = [
@@ -249,7 +256,10 @@ def inspect_bag(
     )
 
 
-_Estimates = dict[tuple[float, float], PublishedEstimate]
+_Ground = tuple[float, float, float]
+"""mu_s, sigma_s and correlation."""
+
+_Estimates = dict[_Ground, PublishedEstimate]
 
 
 def _survey(
@@ -277,13 +287,13 @@ def _survey(
         if raw.type_name == _ESTIMATE:
             message = bag.decode(raw)
             shares = zip(message.failure_codes, message.failure_shares, strict=False)
-            published.setdefault(message.mesh_id, {})[message.mu_s, message.sigma_s] = (
-                PublishedEstimate(
-                    message.mfpt,
-                    message.failure_probability,
-                    message.lambda_2,
-                    {_label(code): float(share) for code, share in shares},
-                )
+            # Where estimates have no such field, they are of independent slopes.
+            ground = message.mu_s, message.sigma_s, getattr(message, "correlation", 0.0)
+            published.setdefault(message.mesh_id, {})[ground] = PublishedEstimate(
+                message.mfpt,
+                message.failure_probability,
+                message.lambda_2,
+                {_label(code): float(share) for code, share in shares},
             )
     return checks, published, first, last, problems
 
@@ -291,7 +301,7 @@ def _survey(
 def _mesh_report(
     recorded: RecordedMesh,
     published: _Estimates,
-    wanted: list[tuple[float, float]] | None,
+    wanted: list[_Ground] | None,
     problems: list[str],
 ) -> MeshReport:
     mesh, settings = recorded.mesh, recorded.settings
@@ -300,21 +310,20 @@ def _mesh_report(
     if mesh is not None:
         codes, counts = np.unique(mesh.outcomes[1:], return_counts=True)
         outcomes = {_label(code): int(n) for code, n in zip(codes, counts, strict=True)}
-        for mu_s, sigma_s in published if wanted is None else wanted:
+        for ground in published if wanted is None else wanted:
+            mu_s, sigma_s, correlation = ground
             try:
-                found = metastability(mesh, mu_s, sigma_s)
+                found = metastability(mesh, mu_s, sigma_s, correlation)
             except (ChainError, InputError) as error:
                 if wanted is not None and isinstance(error, InputError):
                     raise
                 problems.append(f"mesh {recorded.mesh_id}, sigma_s {sigma_s:g} rad: {error}")
                 continue
-            was = published.get((mu_s, sigma_s))
+            was = published.get(ground)
             shares = {_label(code): share for code, share in found.failure_shares.items()}
             now = PublishedEstimate(found.mfpt, found.failure_probability, found.lambda_2, shares)
             same = None if was is None else was == now
-            estimates.append(
-                EstimateReport(mu_s, sigma_s, **vars(now), published=was, identical=same)
-            )
+            estimates.append(EstimateReport(*ground, **vars(now), published=was, identical=same))
             if was is not None and was != now:
                 problems.append(
                     f"mesh {recorded.mesh_id}, sigma_s {sigma_s:g} rad: an MFPT of {was.mfpt!r} "

@@ -23,20 +23,22 @@ def inspect(args: argparse.Namespace) -> int:
     """Report on a bag; fails if anything in it is missing or does not come out again."""
     sigmas = args.sigma and [options.spread("--sigma", sigma) for sigma in args.sigma]
     mean = None if args.mean is None else options.slope("--mean", args.mean)
-    if mean is not None and not sigmas:
-        raise InputError("--sigma", None, "at least one standard deviation to go with --mean")
+    for option, value in (("--mean", mean), ("--correlation", args.correlation)):
+        if value is not None and not sigmas:
+            allowed = f"at least one standard deviation to go with {option}"
+            raise InputError("--sigma", None, allowed)
     require_ros("biped_mfpt_msgs.msg")
     from biped_mfpt_ros.bag.repair import salvage
     from biped_mfpt_ros.bag.report import inspect_bag
 
     if args.repair is None:
-        report = inspect_bag(args.bag, sigmas, mean)
+        report = inspect_bag(args.bag, sigmas, mean, args.correlation)
     else:
         saved = salvage(args.bag, args.repair)
         if not args.quiet:
             count = sum(saved.counts.values())
             print(f"saved {count} messages of {saved.source} in {saved.path}", file=sys.stderr)
-        report = inspect_bag(saved.path, sigmas, mean)
+        report = inspect_bag(saved.path, sigmas, mean, args.correlation)
         report.problems[:0] = [f"not saved of {saved.source}: {text}" for text in saved.missing]
     print(json_text(report.to_dict()) if args.json else _text(report))
     return EXIT_FAILED if report.problems or not report.identical else 0
@@ -71,6 +73,7 @@ def _mesh_text(mesh: MeshReport) -> str:
         (
             f"{math.degrees(e.mu_s):g} deg",
             f"{math.degrees(e.sigma_s):g} deg",
+            f"{e.correlation:g}",
             repr(e.mfpt),
             "-" if e.published is None else repr(e.published.mfpt),
             {True: "yes", False: "no", None: "-"}[e.identical],
@@ -78,5 +81,6 @@ def _mesh_text(mesh: MeshReport) -> str:
         for e in mesh.estimates
     ]
     if rows:
-        parts.append(table(("mean", "sigma", "MFPT from the bag", "as published", "same"), rows))
+        header = ("mean", "sigma", "correlation", "MFPT from the bag", "as published", "same")
+        parts.append(table(header, rows))
     return "\n".join(parts)

@@ -201,7 +201,12 @@ class Client:
         return result
 
     def published_mfpt(
-        self, mesh_id: str, mu_s: float, sigma_s: Sequence[float], timeout: float
+        self,
+        mesh_id: str,
+        mu_s: float,
+        sigma_s: Sequence[float],
+        correlation: float,
+        timeout: float,
     ) -> list[MfptEstimate]:
         """The MFPT of a mesh as the analysis publishes it, one for each ``sigma_s``."""
 
@@ -209,7 +214,8 @@ class Client:
             mine = {
                 estimate.sigma_s: estimate
                 for estimate in self._estimates
-                if estimate.mesh_id == mesh_id and estimate.mu_s == mu_s
+                if (estimate.mesh_id, estimate.mu_s, estimate.correlation)
+                == (mesh_id, mu_s, correlation)
             }
             return [mine[sigma] for sigma in sigma_s if sigma in mine]
 
@@ -217,12 +223,14 @@ class Client:
         return found()
 
     def compute_mfpt(
-        self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]
+        self, mesh_id: str, mu_s: float, sigma_s: Sequence[float], correlation: float = 0.0
     ) -> list[MfptEstimate]:
         """Ask the analysis for the MFPT of a mesh at any ``sigma_s``; AnalysisFailed if in vain."""
-        return self.answer(self.ask_mfpt(mesh_id, mu_s, sigma_s))
+        return self.answer(self.ask_mfpt(mesh_id, mu_s, sigma_s, correlation))
 
-    def ask_mfpt(self, mesh_id: str, mu_s: float, sigma_s: Sequence[float]) -> Future:
+    def ask_mfpt(
+        self, mesh_id: str, mu_s: float, sigma_s: Sequence[float], correlation: float = 0.0
+    ) -> Future:
         """Ask as `compute_mfpt` does, without waiting for the `answer`.
 
         It may cost much, so it is asked once: an analysis of which an estimate has come has found
@@ -233,6 +241,7 @@ class Client:
                 mesh_id=mesh_id,
                 mu_s=mu_s,
                 sigma_s=packed(np.array(sigma_s), "d"),
+                correlation=correlation,
                 client=self._name,
             )
         )

@@ -54,17 +54,22 @@ def mfpt(args: argparse.Namespace) -> None:
 
     mean = options.mean_of(args)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
+    correlation = options.correlation_of(args)
     grown, result = grow(args)
     start = time.perf_counter()
     estimates = []
-    for sigma_deg, found in zip(args.sigma, metastabilities(grown, mean, sigmas), strict=True):
+    solved = metastabilities(grown, mean, sigmas, correlation=correlation)
+    for sigma_deg, found in zip(args.sigma, solved, strict=True):
         if isinstance(found, ChainError):
             raise found
         estimates.append(
-            estimate_row(args.controller, args.mean, sigma_deg, found, found.failure_shares)
+            estimate_row(
+                args.controller, args.mean, sigma_deg, correlation, found, found.failure_shares
+            )
         )
     result |= {
         "mu_s": mean,
+        "correlation": correlation,
         "estimates": estimates,
         "chain_seconds": time.perf_counter() - start,
     }

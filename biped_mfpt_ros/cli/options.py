@@ -15,7 +15,7 @@ from biped_mfpt_ros.control.controller import SCHEMES, Controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.models import MODEL_FIELDS, in_order, model_values, robot_from_file
 from biped_mfpt_ros.walker.robot import Robot, WalkerModel
-from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG, slope_set
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT_DEG, check_correlation, slope_set
 
 
 def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -104,6 +104,14 @@ def spread(option: str, degrees: float) -> float:
     if not 0.0 < degrees < math.inf:
         raise InputError(option, degrees, "a finite number of degrees > 0")
     return math.radians(degrees)
+
+
+def correlation_of(args: argparse.Namespace) -> float:
+    """The correlation of successive slopes; other than 0 a mesh has to be clustered."""
+    correlation = check_correlation(args.correlation)
+    if correlation != 0.0 and getattr(args, "unclustered", False):
+        raise InputError("--correlation", correlation, "0 with --unclustered")
+    return correlation
 
 
 def described(controller: Controller, model: WalkerModel) -> dict[str, Any]:

@@ -46,12 +46,14 @@ def picture(args: argparse.Namespace) -> None:
 def _of_walk(args: argparse.Namespace) -> Picture:
     controller, model = options.walker_of(args)
     mean, sigma = options.slope("--mean", args.mean), options.spread("--sigma", args.sigma)
+    correlation = options.correlation_of(args)
     with work(args.quiet):
         cycle = find_limit_cycle(controller, 0.0, model)
         walk = gaits.rough_walk(
             controller,
             sigma,
             mu_s=mean,
+            correlation=correlation,
             seed=args.seed,
             number=args.number,
             last_steps=args.last_steps,
@@ -72,9 +74,10 @@ def _of_walk(args: argparse.Namespace) -> Picture:
 
 def _of_mesh(args: argparse.Namespace) -> Picture:
     mean, sigma = options.mean_of(args), options.spread("--sigma", args.sigma)
+    correlation = options.correlation_of(args)
     mesh, _ = grow(args)
     if args.kind == "mesh":
         return mesh_pictures.mesh_plane(mesh, args.controller)
-    found = metastability(mesh, mean, sigma)
+    found = metastability(mesh, mean, sigma, correlation)
     draw = mesh_pictures.where_it_falls if args.kind == "falls" else mesh_pictures.mesh_distribution
-    return draw(mesh, found, mean, sigma, args.controller)
+    return draw(mesh, found, mean, sigma, args.controller, correlation)

@@ -33,7 +33,7 @@ from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.report import paper
 from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
-from biped_mfpt_ros.report.tables import difference, number, table
+from biped_mfpt_ros.report.tables import correlation_text, difference, number, table
 from biped_mfpt_ros.walker.robot import WalkerModel
 
 START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> None:
     slopes = options.slopes_of(args)
     mean = options.mean_of(args)
     sigmas = [options.spread("--sigma", sigma) for sigma in args.sigma]
+    correlation = options.correlation_of(args)
     workers = len(os.sched_getaffinity(0)) if args.workers is None else args.workers
     for option, value, least in (
         ("--workers", workers, 1),
@@ -71,7 +72,9 @@ def run(args: argparse.Namespace) -> None:
     from biped_mfpt_ros.nodes.messages import MeshSettings
     from biped_mfpt_ros.nodes.spin import prepare_environment
 
-    AnalysisParameters(sigma_s_deg=tuple(args.sigma), mu_s_deg=args.mean)  # checks their range
+    AnalysisParameters(  # checks their range
+        sigma_s_deg=tuple(args.sigma), mu_s_deg=args.mean, correlation=correlation
+    )
     settings = MeshSettings(
         controller, model, slopes, args.threshold, **options.mesh_settings(args)
     )
@@ -85,6 +88,7 @@ def run(args: argparse.Namespace) -> None:
         "slope_limit_deg": args.slope_limit,
         "slopes": len(slopes),
         "mu_s": mean,
+        "correlation": correlation,
     }
     picture = directory / "mfpt.png"
     with (
@@ -98,8 +102,10 @@ def run(args: argparse.Namespace) -> None:
         progress.say(f"running in {directory}, ROS namespace {namespace}")
         pipeline = Pipeline(processes, progress, namespace)
         recorder = pipeline.record(directory / "bag", on_error=args.on_record_error)
-        pipeline.start(workers, args.mean, args.sigma, checkpoint=checkpoint)
-        result |= pipeline.mesh(settings, mean, dict(zip(sigmas, args.sigma, strict=True)))
+        pipeline.start(workers, args.mean, args.sigma, correlation, checkpoint=checkpoint)
+        result |= pipeline.mesh(
+            settings, mean, dict(zip(sigmas, args.sigma, strict=True)), correlation
+        )
         # The walks can have all cores, and the bag is closed whatever happens to them.
         progress.show("stopping the nodes")
         processes.stop()
@@ -214,6 +220,7 @@ class Pipeline:
         workers: int,
         mean_deg: float,
         sigma_deg: Sequence[float],
+        correlation: float = 0.0,
         meshes_at_once: int = 4,
         checkpoint: Path | None = None,
     ) -> None:
@@ -230,6 +237,7 @@ class Pipeline:
             "analysis",
             mu_s_deg=mean_deg,
             sigma_s_deg=list(sigma_deg),
+            correlation=correlation,
             keep_meshes=4 * meshes_at_once,
         )
         self._simulators = {f"simulator_{i}" for i in range(1, workers + 1)}
@@ -256,7 +264,9 @@ class Pipeline:
         environment = os.environ | {"RCUTILS_COLORIZED_OUTPUT": "0", "PYTHONUNBUFFERED": "1"}
         return self._processes.start(name, command, environment=environment, last=last)
 
-    def mesh(self, settings: Any, mean: float, sigmas: dict[float, float]) -> dict[str, Any]:
+    def mesh(
+        self, settings: Any, mean: float, sigmas: dict[float, float], correlation: float = 0.0
+    ) -> dict[str, Any]:
         """Grow the mesh and get its MFPT for each sigma (rad to degrees)."""
         from biped_mfpt_ros.cli.client import Client
 
@@ -284,10 +294,12 @@ class Pipeline:
                     name = self._start_mesher()
                     client.wait(partial(client.reaches, name), START_TIMEOUT, name)
             self._progress.show("waiting for the analysis")
-            estimates = client.published_mfpt(grown.mesh_id, mean, list(sigmas), RESULT_TIMEOUT)
+            estimates = client.published_mfpt(
+                grown.mesh_id, mean, list(sigmas), correlation, RESULT_TIMEOUT
+            )
             low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)
             curve = client.compute_mfpt(
-                grown.mesh_id, mean, list(np.linspace(low, high, _CURVE_POINTS))
+                grown.mesh_id, mean, list(np.linspace(low, high, _CURVE_POINTS)), correlation
             )
             if time.monotonic() < all_there:
                 self._progress.show("giving the recorder time to hear of everything")
@@ -338,7 +350,7 @@ def _last_words(child: Child) -> str:
 
 def _estimate(message: Any, sigma_deg: float, controller: str, mean: float) -> dict[str, Any]:
     codes = zip(message.failure_codes, message.failure_shares, strict=True)
-    return estimate_row(controller, mean, sigma_deg, message, dict(codes))
+    return estimate_row(controller, mean, sigma_deg, message.correlation, message, dict(codes))
 
 
 def _walks(
@@ -360,6 +372,7 @@ def _walks(
             args.walks,
             args.seed,
             mu_s=mean,
+            correlation=args.correlation,
             model=model,
             progress=_counting(progress, f"Monte Carlo at sigma {row['sigma_s_deg']:g} deg"),
         )
@@ -367,7 +380,11 @@ def _walks(
             {"sigma_s": row["sigma_s"], "sigma_s_deg": row["sigma_s_deg"]}
             | {"walks": args.walks, "seed": args.seed}
             | monte_carlo_result(found)
-            | {"paper": paper.monte_carlo(controller.name, args.mean, row["sigma_s_deg"])}
+            | {
+                "paper": paper.monte_carlo(
+                    controller.name, args.mean, row["sigma_s_deg"], args.correlation
+                )
+            }
         )
     return out
 
@@ -389,7 +406,13 @@ def _draw(
     sigma_deg = max(args.sigma)
     state = find_limit_cycle(controller, 0.0, model).state
     walking = pictures.example_walk(
-        controller, state, math.radians(args.mean), math.radians(sigma_deg), _PICTURE_STEPS, model
+        controller,
+        state,
+        math.radians(args.mean),
+        math.radians(sigma_deg),
+        _PICTURE_STEPS,
+        model,
+        args.correlation,
     )
     points = [
         (row["sigma_s_deg"], row["paper"], kind)
@@ -402,7 +425,8 @@ def _draw(
             file,
             f"{controller.name} on rough ground",
             walking,
-            f"a walk on slopes with a standard deviation of {sigma_deg:g}°",
+            f"a walk on slopes with a standard deviation of {sigma_deg:g}°"
+            f"{correlation_text(args.correlation)}",
             np.degrees([point["sigma_s"] for point in result["curve"]]),
             np.array([point["mfpt"] for point in result["curve"]]),
             points,

@@ -40,7 +40,12 @@ def shares_table(values: Mapping[Any, float]) -> str:
 
 
 def estimate_row(
-    controller: str, mean_deg: float, sigma_deg: float, found: Any, falls: Mapping[Any, float]
+    controller: str,
+    mean_deg: float,
+    sigma_deg: float,
+    correlation: float,
+    found: Any,
+    falls: Mapping[Any, float],
 ) -> dict[str, Any]:
     """An estimate of the MFPT, for JSON; ``found`` has mfpt, failure_probability, lambda_2."""
     return {
@@ -50,7 +55,7 @@ def estimate_row(
         "failure_probability": found.failure_probability,
         "lambda_2": found.lambda_2,
         "failure_shares": shares(falls),
-        "paper": paper.mfpt(controller, mean_deg, sigma_deg),
+        "paper": paper.mfpt(controller, mean_deg, sigma_deg, correlation),
     }
 
 

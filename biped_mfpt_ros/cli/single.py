@@ -101,6 +101,7 @@ def monte_carlo(args: argparse.Namespace) -> None:
     """Walk on random slopes until the fall."""
     controller, model = options.walker_of(args)
     mean, sigma = options.slope("--mean", args.mean), options.spread("--sigma", args.sigma)
+    correlation = options.correlation_of(args)
     with work(args.quiet) as progress:
         result = walk(
             controller,
@@ -108,17 +109,19 @@ def monte_carlo(args: argparse.Namespace) -> None:
             args.walks,
             args.seed,
             mu_s=mean,
+            correlation=correlation,
             model=model,
             max_steps=args.max_steps,
             progress=lambda done, total: progress.count("monte-carlo", done, total, "walks"),
         )
         seconds = progress.seconds
-    reference = paper.monte_carlo(controller.name, args.mean, args.sigma)
+    reference = paper.monte_carlo(controller.name, args.mean, args.sigma, correlation)
     if args.json:
         print(
             json_text(
                 options.described(controller, model)
-                | {"mu_s": mean, "sigma_s": sigma, "walks": args.walks, "seed": args.seed}
+                | {"mu_s": mean, "sigma_s": sigma, "correlation": correlation}
+                | {"walks": args.walks, "seed": args.seed}
                 | monte_carlo_result(result)
                 | {"max_steps": args.max_steps, "seconds": seconds, "paper": reference}
             )

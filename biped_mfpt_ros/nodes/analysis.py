@@ -36,6 +36,8 @@ _MOST_WAITING = 64  # requests
 _MOST_SIGMAS = 10_000  # in one request
 _PROGRESS_EVERY = 5.0  # s
 _SIGMAS_AT_ONCE = 64
+CORRELATION_LIMIT = 0.999
+"""Of the parameter: what ROS knows of ranges includes their ends, and 1 is out of range."""
 _PATIENCE = 10.0  # s, for messages of a mesh that was closed
 
 
@@ -48,6 +50,12 @@ class AnalysisParameters(NodeParameters):
     )
     mu_s_deg: float = parameter(
         0.0, "degrees, mean slope to publish MFPT for", -SLOPE_LIMIT_DEG, SLOPE_LIMIT_DEG
+    )
+    correlation: float = parameter(
+        0.0,
+        "correlation of each slope with the one before to publish MFPT for; 0: independent",
+        -CORRELATION_LIMIT,
+        CORRELATION_LIMIT,
     )
     keep_meshes: int = parameter(4, "complete meshes kept for compute_mfpt", 1, 10_000)
     keep_states: int = parameter(
@@ -143,7 +151,7 @@ class Analysis(Node):
             self._keep(mesh_id, known, parameters)
             sigmas = [math.radians(sigma_deg) for sigma_deg in parameters.sigma_s_deg]
             mu_s = math.radians(parameters.mu_s_deg)
-            found = self._solve(mesh_id, known, mu_s, sigmas)
+            found = self._solve(mesh_id, known, mu_s, sigmas, parameters.correlation)
             for sigma_deg, estimate in zip(parameters.sigma_s_deg, found, strict=True):
                 if isinstance(estimate, ChainError):
                     self.get_logger().error(f"{mesh_id}: no MFPT at {sigma_deg:g}: {estimate}")
@@ -178,7 +186,7 @@ class Analysis(Node):
             del self._known[oldest]
 
     def _solve(
-        self, mesh_id: str, known: _Known, mu_s: float, sigmas: list[float]
+        self, mesh_id: str, known: _Known, mu_s: float, sigmas: list[float], correlation: float
     ) -> Iterator[MfptEstimate | ChainError]:
         """Estimates for several sigma_s, with progress in the log if that takes long."""
         start = said = time.perf_counter()
@@ -199,7 +207,9 @@ class Analysis(Node):
 
             begun = time.perf_counter()
             try:
-                found = metastabilities(known.mesh, mu_s, batch, on_progress=on_progress)
+                found = metastabilities(
+                    known.mesh, mu_s, batch, correlation=correlation, on_progress=on_progress
+                )
             except InputError as error:
                 if error.field.startswith("sigma_s["):
                     index = int(error.field[len("sigma_s[") : -1])
@@ -213,7 +223,14 @@ class Analysis(Node):
                     result
                     if isinstance(result, ChainError)
                     else estimate_message(
-                        mesh_id, known.controller, known.mesh, mu_s, sigma_s, result, seconds
+                        mesh_id,
+                        known.controller,
+                        known.mesh,
+                        mu_s,
+                        sigma_s,
+                        correlation,
+                        result,
+                        seconds,
                     )
                 )
 
@@ -252,7 +269,8 @@ class Analysis(Node):
                 raise InputError(
                     "sigma_s", f"{len(sigmas)} numbers", f"1 to {_MOST_SIGMAS} numbers"
                 )
-            for i, estimate in enumerate(self._solve(mesh_id, known, request.mu_s, sigmas)):
+            found = self._solve(mesh_id, known, request.mu_s, sigmas, request.correlation)
+            for i, estimate in enumerate(found):
                 if isinstance(estimate, ChainError):
                     raise ChainError(f"sigma_s[{i}]: {estimate}")
                 estimates.append(estimate)

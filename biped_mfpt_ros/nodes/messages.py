@@ -415,6 +415,7 @@ def estimate_message(
     mesh: Mesh,
     mu_s: float,
     sigma_s: float,
+    correlation: float,
     result: Metastability,
     seconds: float,
 ) -> msg.MfptEstimate:
@@ -430,6 +431,8 @@ def estimate_message(
         The mesh itself.
     mu_s, sigma_s : float
         rad, mean and standard deviation of the slope.
+    correlation : float
+        Of each slope with the one before.
     result : Metastability
         What came out.
     seconds : float
@@ -441,6 +444,7 @@ def estimate_message(
         controller=controller,
         mu_s=mu_s,
         sigma_s=sigma_s,
+        correlation=correlation,
         mfpt=float(result.mfpt),
         failure_probability=float(result.failure_probability),
         lambda_2=float(result.lambda_2),

@@ -40,9 +40,10 @@ from biped_mfpt_ros.report.style import (
     tidy,
     with_palette,
 )
+from biped_mfpt_ros.report.tables import correlation_text
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
-from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, check_correlation, deviations
 
 FRAME_INTERVAL = 0.05
 """s between the frames of an animation: 20 a second, in real time."""
@@ -75,6 +76,8 @@ class RoughWalk:
         Torque limit, friction and so on.
     mu_s, sigma_s : float
         rad, mean and standard deviation of the slope.
+    correlation : float
+        Of each slope with the one before.
     seed, number : int
         It is walk ``number`` of this seed of `monte_carlo`.
     steps : int
@@ -91,6 +94,7 @@ class RoughWalk:
     model: WalkerModel
     mu_s: float
     sigma_s: float
+    correlation: float
     seed: int
     number: int
     steps: int
@@ -120,6 +124,7 @@ def rough_walk(
     sigma_s: float,
     *,
     mu_s: float = 0.0,
+    correlation: float = 0.0,
     seed: int = 1,
     number: int = 0,
     last_steps: int = 8,
@@ -138,6 +143,8 @@ def rough_walk(
         What walks.
     sigma_s, mu_s : float
         rad, standard deviation (> 0) and mean of the slope.
+    correlation : float, optional
+        Of each slope with the one before, as for `monte_carlo`.
     seed, number : int, optional
         Of the walk, >= 0.
     last_steps : int, optional
@@ -162,6 +169,7 @@ def rough_walk(
         raise InputError("sigma_s", sigma_s, "finite, > 0 rad")
     if not abs(mu_s) <= SLOPE_LIMIT:
         raise InputError("mu_s", mu_s, f"within {SLOPE_LIMIT:.4f} rad")
+    check_correlation(correlation)
     for name, value, least in (
         ("seed", seed, 0),
         ("number", number, 0),
@@ -176,12 +184,13 @@ def rough_walk(
     random = np.random.Generator(np.random.PCG64([seed, number]))
     kept: deque[tuple[np.ndarray, float, float]] = deque(maxlen=last_steps)
     draws: list[float] = []
+    off = np.array([-mu_s])
     steps = 0
     while steps < max_steps:
         steps += 1
         if not draws:
-            drawn = mu_s + sigma_s * random.standard_normal(_BLOCK)
-            draws = np.clip(drawn, -SLOPE_LIMIT, SLOPE_LIMIT)[::-1].tolist()
+            off = deviations(random.standard_normal(_BLOCK), off[-1], sigma_s, correlation)
+            draws = np.clip(mu_s + off, -SLOPE_LIMIT, SLOPE_LIMIT)[::-1].tolist()
         ahead = draws.pop()
         kept.append((here, behind, ahead))
         tried = simulate_steps(controller, here[None], [behind], [ahead], model)
@@ -194,6 +203,7 @@ def rough_walk(
         model=model,
         mu_s=mu_s,
         sigma_s=sigma_s,
+        correlation=correlation,
         seed=seed,
         number=number,
         steps=steps,
@@ -291,7 +301,7 @@ def _frames(walk: RoughWalk, walking: pictures.Walk) -> list[np.ndarray]:
     per_newton = _BODY_WEIGHT / (walk.model.robot.mass * walk.model.robot.gravity)
     what = (
         f"{walk.controller.name}, slopes {math.degrees(walk.mu_s):g} ± "
-        f"{math.degrees(walk.sigma_s):g}°"
+        f"{math.degrees(walk.sigma_s):g}°{correlation_text(walk.correlation)}"
     )
     frames = []
     last = len(walking.points) - 1
@@ -330,8 +340,9 @@ def _sentence(walk: RoughWalk) -> str:
     )
     return (
         f"{steps} of {walk.controller.name} on slopes of mean {math.degrees(walk.mu_s):g}° and "
-        f"standard deviation {math.degrees(walk.sigma_s):g}° (walk {walk.number} of seed "
-        f"{walk.seed}), to the moment {end}."
+        f"standard deviation {math.degrees(walk.sigma_s):g}°"
+        f"{correlation_text(walk.correlation)} (walk {walk.number} of seed {walk.seed}), "
+        f"to the moment {end}."
     )
 
 

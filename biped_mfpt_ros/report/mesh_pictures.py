@@ -13,7 +13,11 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from biped_mfpt_ros.chain.markov import Metastability, slope_probabilities
+from biped_mfpt_ros.chain.markov import (
+    Metastability,
+    conditional_probabilities,
+    slope_probabilities,
+)
 from biped_mfpt_ros.chain.mesh import Mesh
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.report.style import (
@@ -27,7 +31,7 @@ from biped_mfpt_ros.report.style import (
     slope_norm,
     tidy,
 )
-from biped_mfpt_ros.report.tables import number
+from biped_mfpt_ros.report.tables import correlation_text, number
 from biped_mfpt_ros.walker.outcome import Outcome
 
 _FALLS = tuple(Outcome)[1:]
@@ -105,7 +109,12 @@ def mesh_plane(mesh: Mesh, name: str) -> Picture:
 
 
 def mesh_distribution(
-    mesh: Mesh, found: Metastability, mu_s: float, sigma_s: float, name: str
+    mesh: Mesh,
+    found: Metastability,
+    mu_s: float,
+    sigma_s: float,
+    name: str,
+    correlation: float = 0.0,
 ) -> Picture:
     """Draw the metastable distribution over the principal plane of a mesh.
 
@@ -114,11 +123,14 @@ def mesh_distribution(
     mesh : Mesh
         The mesh.
     found : Metastability
-        Of that mesh for slopes of mean ``mu_s`` and standard deviation ``sigma_s``, rad.
+        Of that mesh for slopes of mean ``mu_s`` and standard deviation ``sigma_s``, rad, and
+        ``correlation`` with the one before.
     mu_s, sigma_s : float
         rad, for the caption.
     name : str
         Of the controller.
+    correlation : float, optional
+        For the caption.
     """
     plane = principal_plane(mesh)
     weights = _distribution(mesh, found)
@@ -143,8 +155,9 @@ def mesh_distribution(
     return Picture(
         f"Metastable distribution of {name}",
         f"Where {name} is found while it walks on slopes of mean {math.degrees(mu_s):g}° and "
-        f"standard deviation {math.degrees(sigma_s):g}° and has not fallen for long (MFPT "
-        f"{number(found.mfpt)} steps): {_of_states(half, 'half')}, {_of_states(most, '99 %')} of "
+        f"standard deviation {math.degrees(sigma_s):g}°{correlation_text(correlation)} and has not "
+        f"fallen for long (MFPT {number(found.mfpt)} steps): "
+        f"{_of_states(half, 'half')}, {_of_states(most, '99 %')} of "
         f"the time, of {len(weights)}. Grey: less than {_LEAST_WEIGHT:g}. {_variance_text(plane)}",
         png(figure),
     )
@@ -200,7 +213,9 @@ def _variance_text(plane: Plane) -> str:
 # Falls ------------------------------------------------------------------------------------------
 
 
-def falls_by_slope(mesh: Mesh, distribution: np.ndarray) -> np.ndarray:
+def falls_by_slope(
+    mesh: Mesh, distribution: np.ndarray, ahead: np.ndarray | None = None
+) -> np.ndarray:
     """Chance of each way to fall on each slope ahead, from a distribution over the states.
 
     Parameters
@@ -209,6 +224,9 @@ def falls_by_slope(mesh: Mesh, distribution: np.ndarray) -> np.ndarray:
         Outcomes of every state and slope.
     distribution : numpy.ndarray
         Over all states, the failure state counted, shape (n,), sum 1.
+    ahead : numpy.ndarray, optional
+        Probabilities of the slopes ahead of each state but the failure state, shape (n - 1, m),
+        where they depend on it.
 
     Returns
     -------
@@ -216,7 +234,12 @@ def falls_by_slope(mesh: Mesh, distribution: np.ndarray) -> np.ndarray:
         Shape (11, m), by `Outcome` and slope; row 0 is the chance of no fall, columns sum to 1.
     """
     weights = np.asarray(distribution)[1:]
-    return np.stack([weights @ (mesh.outcomes[1:] == outcome) for outcome in Outcome])
+    if ahead is None:
+        return np.stack([weights @ (mesh.outcomes[1:] == outcome) for outcome in Outcome])
+    joint = weights[:, np.newaxis] * ahead
+    chances = [(joint * (mesh.outcomes[1:] == outcome)).sum(axis=0) for outcome in Outcome]
+    with np.errstate(invalid="ignore"):  # slopes that never occur
+        return np.nan_to_num(np.stack(chances) / joint.sum(axis=0))
 
 
 def falls_by_slope_before(
@@ -231,7 +254,7 @@ def falls_by_slope_before(
     distribution : numpy.ndarray
         Over all states, the failure state counted, shape (n,), sum 1.
     probabilities : numpy.ndarray
-        Of the slopes ahead, shape (m,).
+        Of the slopes ahead, shape (m,), or of each state but the failure state, shape (n - 1, m).
 
     Returns
     -------
@@ -243,7 +266,7 @@ def falls_by_slope_before(
         [
             np.bincount(
                 preceding,
-                weights * ((mesh.outcomes[1:] == outcome) @ probabilities),
+                weights * ((mesh.outcomes[1:] == outcome) * probabilities).sum(axis=1),
                 len(mesh.slopes),
             )
             for outcome in _FALLS
@@ -252,22 +275,31 @@ def falls_by_slope_before(
 
 
 def where_it_falls(
-    mesh: Mesh, found: Metastability, mu_s: float, sigma_s: float, name: str
+    mesh: Mesh,
+    found: Metastability,
+    mu_s: float,
+    sigma_s: float,
+    name: str,
+    correlation: float = 0.0,
 ) -> Picture:
     """Draw on which slopes and why a controller falls; arguments as of `mesh_distribution`.
 
     From above: chance of a fall on the slope ahead; ways to fall there; share of way and slope
     ahead in all falls; share of way and slope before in all falls.
     """
-    _distribution(mesh, found)
-    chances = falls_by_slope(mesh, found.distribution)[1:]
-    probabilities = slope_probabilities(mesh.slopes, mu_s, sigma_s)
+    weights, ahead = _distribution(mesh, found), None
+    of_each = probabilities = slope_probabilities(mesh.slopes, mu_s, sigma_s)
+    if correlation != 0.0:
+        rows = conditional_probabilities(mesh.slopes, mu_s, sigma_s, correlation)
+        of_each = ahead = rows[mesh.preceding[1:]]
+        probabilities = weights @ ahead
+    chances = falls_by_slope(mesh, found.distribution, ahead)[1:]
     slopes_deg, edges = np.degrees(mesh.slopes), _edges(np.degrees(mesh.slopes))
     fall = chances.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         ways = np.where(fall > 0.0, chances / fall, 0.0)
     share = _shares(chances * probabilities)
-    before = _shares(falls_by_slope_before(mesh, found.distribution, probabilities))
+    before = _shares(falls_by_slope_before(mesh, found.distribution, of_each))
 
     figure = new_figure(7.6)
     top, middle, ahead, behind = figure.subplots(4, 1, sharex=True)
@@ -310,7 +342,7 @@ def where_it_falls(
     )  # fmt: skip
     return Picture(
         f"Where and why {name} falls",
-        _falls_text(name, slopes_deg, share, found, mu_s, sigma_s),
+        _falls_text(name, slopes_deg, share, found, mu_s, sigma_s, correlation),
         png(figure),
     )
 
@@ -349,11 +381,13 @@ def _falls_text(
     found: Metastability,
     mu_s: float,
     sigma_s: float,
+    correlation: float,
 ) -> str:
     text = (
         f"{name} on slopes of mean {math.degrees(mu_s):g}° and standard deviation "
-        f"{math.degrees(sigma_s):g}°, when it has not fallen for long (MFPT {number(found.mfpt)} "
-        "steps). From above: the chance that the next step is a fall, over the slope ahead; how "
+        f"{math.degrees(sigma_s):g}°{correlation_text(correlation)}, when it has not fallen for "
+        f"long (MFPT {number(found.mfpt)} steps). From above: the chance that the next step is a "
+        "fall, over the slope ahead; how "
         "it then falls; how much of all falls happens over the slopes ahead, and over those "
         "before the step."
     )

@@ -27,9 +27,9 @@ def _known(name: str) -> bool:
     return label in _data()["table5_sigma1"].get(scheme, {})
 
 
-def mfpt(name: str, mean_deg: float, sigma_deg: float) -> float | None:
+def mfpt(name: str, mean_deg: float, sigma_deg: float, correlation: float = 0.0) -> float | None:
     """The paper's mean first-passage time from its mesh, steps; None where it gives none."""
-    if not _known(name) or mean_deg != 0.0:
+    if not _known(name) or mean_deg != 0.0 or correlation != 0.0:
         return None
     scheme, _, label = name.partition("/")
     at, rows = _table(scheme)
@@ -38,9 +38,11 @@ def mfpt(name: str, mean_deg: float, sigma_deg: float) -> float | None:
     return float(rows["estimate_eq34"][label]) if sigma_deg == at else None
 
 
-def monte_carlo(name: str, mean_deg: float, sigma_deg: float) -> float | None:
+def monte_carlo(
+    name: str, mean_deg: float, sigma_deg: float, correlation: float = 0.0
+) -> float | None:
     """The paper's mean of 10000 Monte Carlo walks, steps; None where it gives none."""
-    if not _known(name) or mean_deg != 0.0:
+    if not _known(name) or mean_deg != 0.0 or correlation != 0.0:
         return None
     scheme, _, label = name.partition("/")
     at, rows = _table(scheme)

@@ -20,7 +20,7 @@ from biped_mfpt_ros.report.style import BODY, GRID, GROUND, OURS, PAPER, STANCE,
 from biped_mfpt_ros.walker.dynamics import to_absolute
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import Robot, WalkerModel
-from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, deviations
 
 _INTERVAL = 0.085  # s between the figures of a sequence
 
@@ -173,16 +173,18 @@ def example_walk(
     sigma_s: float,
     steps: int,
     model: WalkerModel,
+    correlation: float = 0.0,
 ) -> Walk:
     """Walk on random slopes for a picture: up to ``steps`` steps, of the first walks the longest.
 
-    Slopes (rad, mean ``mu_s``, standard deviation ``sigma_s``) come from fixed seeds, so that the
-    picture is always the same.
+    Slopes (rad, mean ``mu_s``, standard deviation ``sigma_s``, ``correlation`` with the one before)
+    come from fixed seeds, so that the picture is always the same.
     """
     best: Walk | None = None
     for seed in range(20):
         random = np.random.default_rng(seed)
-        slopes = np.clip(mu_s + sigma_s * random.standard_normal(steps), -SLOPE_LIMIT, SLOPE_LIMIT)
+        off = deviations(random.standard_normal(steps), -mu_s, sigma_s, correlation)
+        slopes = np.clip(mu_s + off, -SLOPE_LIMIT, SLOPE_LIMIT)
         found = walk(controller, state, slopes.tolist(), model)
         if best is None or found.steps[-1] > best.steps[-1]:
             best = found

@@ -65,3 +65,8 @@ def difference(value: float, reference: float) -> str:
     """Difference from a reference, such as ``"+3.2 %"``, or ``"x 1500"`` beyond a factor of 10."""
     ratio = value / reference
     return f"{100.0 * (ratio - 1.0):+.1f} %" if 0.1 <= ratio <= 10.0 else f"x {number(ratio)}"
+
+
+def correlation_text(correlation: float) -> str:
+    """What follows the standard deviation of slopes in a text; nothing for independent ones."""
+    return f", correlation {correlation:g}" if correlation else ""

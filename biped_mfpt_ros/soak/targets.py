@@ -198,7 +198,7 @@ class Published:
             )
         rows = [*messages.transitions_messages(mesh_id, mesh.targets, mesh.outcomes)]
         estimates = [
-            messages.estimate_message(mesh_id, "hzd/base", mesh, 0.0, 0.05, self.estimate, 0.1)
+            messages.estimate_message(mesh_id, "hzd/base", mesh, 0.0, 0.05, 0.0, self.estimate, 0.1)
         ]
         for topic in (infos, states, rows, estimates):
             for sequence, message in enumerate(topic):

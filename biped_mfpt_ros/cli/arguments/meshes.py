@@ -84,6 +84,7 @@ deviations costs one mesh. In this process, without ROS.
 examples:
   biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --slope-step 0.5 --threshold 0.3
   biped-mfpt mfpt --controller hzd/cot --sigma 0.5 1 1.5 2 --mean -1 --json
+  biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --correlation 0.8   rolling ground
 """,
         "walker",
         "mesh",
@@ -151,6 +152,12 @@ examples:
         type=number,
         metavar="DEG",
         help="degrees, mean slope to go with --sigma (default: 0)",
+    )
+    inspect.add_argument(
+        "--correlation",
+        type=number,
+        metavar="R",
+        help="of each slope with the one before, to go with --sigma (default: 0)",
     )
     inspect.add_argument(
         "--repair",

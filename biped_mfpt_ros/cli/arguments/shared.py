@@ -129,6 +129,14 @@ def shared_options() -> dict[str, Parser]:
         metavar="DEG",
         help="degrees, mean slope (default: 0)",
     )
+    terrain.add_argument(
+        "--correlation",
+        type=number,
+        default=0.0,
+        metavar="R",
+        help="of each slope with the one before, above -1 and below 1; above 0 ground rolls, see "
+        "docs/ground.md (default: 0, independent slopes)",
+    )
 
     mesh = group("mesh", "mesh")
     mesh.add_argument(

@@ -27,6 +27,7 @@ number of cores. Slopes beyond 45 degrees are cut to that.
 
 examples:
   biped-mfpt monte-carlo --controller hzd/cot --sigma 2 --walks 10000 --seed 1
+  biped-mfpt monte-carlo --controller hzd/cot --sigma 2 --correlation -0.5
   biped-mfpt monte-carlo --controller hzd/base --sigma 2 --torque-limit none --json
 """,
         "walker",
