@@ -209,7 +209,7 @@ def test_the_optimiser_survives_lost_answers(graph, impatient):
     mesh = backend.grow(cycle, settings, stage, np.array([0.0]), Deadline())
     assert mesh.mesh_id == "grown"
     assert node.executed == 1
-    assert mesh.mfpt(0.0, 0.02) == 7.0
+    assert mesh.mfpt(0.0, 0.02, 0.0) == 7.0
     # What may cost much is asked once.
     assert node.questions.count(1) == 1
     assert node.questions.count(0) >= 3

@@ -498,8 +498,10 @@ def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
     assert again.as_json() == settings.as_json()
     assert again.model == settings.model
     assert again.stages == settings.stages
-    # Studies that were begun before there were candidates, or several runs, go on.
-    assert not {"candidates", "runs"} & set(again.as_json())
+    # Studies that were begun before there were these go on.
+    assert not {"candidates", "correlation", "runs"} & set(again.as_json())
+    rolling = replace(settings, correlation=0.5)
+    assert StudySettings.from_json(rolling.as_json()).correlation == 0.5
     assert StudySettings.from_json(replace(RACE, runs=1).as_json()).run_count == 1
     assert StudySettings.from_json(RACE.as_json()).run_count == RACE.run_count == 4
     given = replace(settings, searcher="given", candidates=((0.1,) * 20, (1.0 / 3.0,) * 20))
@@ -525,6 +527,7 @@ def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
         ("objectives[mfpt]", {"objectives": {"mfpt": -1.0}}),
         ("limits", {"limits": {"weight_max": 1.0}}),
         ("sigma_s", {"sigma_s": math.nan}),
+        ("correlation", {"correlation": 1.0}),
         ("threshold", {"stages": (Stage(0.5, 0.0),)}),
         ("slope_step_deg", {"stages": (Stage(0.3, 0.1),)}),
         ("step", {"step": 0.0}),

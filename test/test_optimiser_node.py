@@ -241,6 +241,8 @@ def test_settings_survive_the_message():
     assert settings_from(goal_message("x", settings)).as_json() == settings.as_json()
     several = replace(settings, searcher="cma-es", runs=7)
     assert settings_from(goal_message("x", several)).as_json() == several.as_json()
+    rolling = replace(settings, correlation=0.5)
+    assert settings_from(goal_message("x", rolling)).as_json() == rolling.as_json()
     given = replace(settings, searcher="given", candidates=((0.1,) * 20, (1.0 / 3.0,) * 20))
     assert settings_from(goal_message("x", given)).as_json() == given.as_json()
 

@@ -12,6 +12,7 @@ from biped_mfpt_ros.chain.mesh import grow_mesh
 from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
+from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.gait.step import simulate_steps
 from biped_mfpt_ros.gait.trace import trace_swing
 from biped_mfpt_ros.optimise.flat import flat_gait
@@ -48,7 +49,7 @@ class Claims:
         mesh = SimpleNamespace(
             mesh_id=f"m{self.grown}", states=self.states, seconds=0.0, step_map_seconds=0.0
         )
-        mesh.mfpt = lambda mu, sigma: claim if sigma == settings.sigma_s else self.checked
+        mesh.mfpt = lambda mu, sigma, rho: claim if sigma == settings.sigma_s else self.checked
         return mesh
 
 
@@ -61,6 +62,11 @@ def scored(start="hzd/mfpt", vector=None, best=None, backend=None, stopping=None
         lambda: space.controller(x), study, best or Best(), backend or LocalBackend(),
         stopping or (lambda: False),
     )  # fmt: skip
+
+
+def same_start():
+    """What `scored` begins with."""
+    return SearchSpace(controller("hzd/mfpt"), rabbit()).controller(np.zeros(22))
 
 
 # On flat ground ----------------------------------------------------------------------------------
@@ -180,6 +186,23 @@ def test_mfpt_is_that_of_the_chain():
     assert found.values["mfpt"] == pytest.approx(mfpt, rel=1e-3)
     assert found.score == math.log10(found.values["mfpt"])
     assert found.confirmed
+
+
+def test_correlated_ground_is_scored_and_walked():
+    same = scored(stages=(Stage(0.5, 0.3),), check_sigmas=(2.0,))
+    found = scored(stages=(Stage(0.5, 0.3),), check_sigmas=(2.0,), correlation=-0.5)
+    cycle = flat_gait(same_start(), WalkerModel(), simulate_steps).cycle
+    mesh = (
+        LocalBackend()
+        .grow(cycle, StudySettings(same_start()), Stage(0.5, 0.3), slope_set(0.5), lambda: None)
+        .mesh
+    )
+    assert found.values["mfpt"] == metastability(mesh, 0.0, math.radians(1.0), -0.5).mfpt
+    walked = monte_carlo(
+        same_start(), math.radians(2.0), 100, 1, correlation=-0.5, state=cycle.state
+    )
+    assert found.values["check_steps"] == walked.counted.mean()
+    assert found.values["check_steps"] != same.values["check_steps"]
 
 
 def test_the_least_of_the_meshes_counts():

@@ -152,6 +152,7 @@ def _settings(args: argparse.Namespace) -> StudySettings:
         model=model,
         mu_s=options.mean_of(args),
         sigma_s=options.spread("--sigma", args.sigma),
+        correlation=options.correlation_of(args),
         **_scoring(args),
     )
 

@@ -127,7 +127,7 @@ def run_study(
             pipeline.record(directory / "bag")
         # The analysis publishes what every trial needs, and nothing else.
         mean_deg, sigma_deg = (degrees_of(r) for r in (settings.mu_s, settings.sigma_s))
-        pipeline.start(workers, mean_deg, [sigma_deg], at_once)
+        pipeline.start(workers, mean_deg, [sigma_deg], settings.correlation, at_once)
         pipeline.optimiser(store, at_once)
         progress.say(f"running in {directory}, ROS namespace /{label}")
         with StudyClient(f"/{label}", pipeline.watch) as client:

@@ -162,7 +162,9 @@ class PipelineBackend:
                 self._estimates.popitem(last=False)
             self._arrived.notify_all()
 
-    def mfpt(self, mesh_id: str, mu_s: float, sigma_s: float, check: Check) -> float:
+    def mfpt(
+        self, mesh_id: str, mu_s: float, sigma_s: float, correlation: float, check: Check
+    ) -> float:
         """MFPT of a mesh: as published if it is, else by asking.
 
         Raises
@@ -179,12 +181,14 @@ class PipelineBackend:
                 check()
             # Of one mesh the estimates are published one after another; the rest can be asked for.
             for estimate in self._estimates.get(mesh_id, []):
-                if (estimate.mu_s, estimate.sigma_s) == (mu_s, sigma_s):
+                ground = (estimate.mu_s, estimate.sigma_s, estimate.correlation)
+                if ground == (mu_s, sigma_s, correlation):
                     return float(estimate.mfpt)
         request = ComputeMfpt.Request(
             mesh_id=mesh_id,
             mu_s=mu_s,
             sigma_s=packed(np.array([sigma_s]), "d"),
+            correlation=correlation,
             client=self._name,
         )
         deadline = time.monotonic() + self._patience()
@@ -224,6 +228,6 @@ class PipelineMesh:
     step_map_seconds: float
     check: Check
 
-    def mfpt(self, mu_s: float, sigma_s: float) -> float:
+    def mfpt(self, mu_s: float, sigma_s: float, correlation: float) -> float:
         """MFPT in steps."""
-        return self.backend.mfpt(self.mesh_id, mu_s, sigma_s, self.check)
+        return self.backend.mfpt(self.mesh_id, mu_s, sigma_s, correlation, self.check)

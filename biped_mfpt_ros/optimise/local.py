@@ -38,10 +38,10 @@ class LocalMesh:
         """States, the failure state counted."""
         return len(self.mesh.states)
 
-    def mfpt(self, mu_s: float, sigma_s: float) -> float:
+    def mfpt(self, mu_s: float, sigma_s: float, correlation: float) -> float:
         """MFPT in steps."""
         try:
-            return float(metastability(self.mesh, mu_s, sigma_s).mfpt)
+            return float(metastability(self.mesh, mu_s, sigma_s, correlation).mfpt)
         except ChainError as error:
             raise MeshFailed(str(error), self.states) from None
 

@@ -89,7 +89,7 @@ class GrownMesh(Protocol):
     def step_map_seconds(self) -> float:
         """S in the step map, summed over who worked on it."""
 
-    def mfpt(self, mu_s: float, sigma_s: float) -> float:
+    def mfpt(self, mu_s: float, sigma_s: float, correlation: float) -> float:
         """MFPT in steps; MeshFailed if its chain cannot be solved."""
 
 
@@ -312,7 +312,7 @@ def _mesh(
             out.step_map_seconds += grown.step_map_seconds
             out.states, out.mesh_id = grown.states, grown.mesh_id
             row |= {"states": grown.states, "mesh_id": grown.mesh_id, "seconds": grown.seconds}
-            mfpt = grown.mfpt(settings.mu_s, settings.sigma_s)
+            mfpt = grown.mfpt(settings.mu_s, settings.sigma_s, settings.correlation)
         except MeshFailed as error:
             row |= {"states": error.states, "problem": str(error)}
             out.note = str(error)
@@ -341,7 +341,7 @@ def _check_by_walks(
             break
         clock.check()
         try:
-            claimed = grown.mfpt(settings.mu_s, sigma)
+            claimed = grown.mfpt(settings.mu_s, sigma, settings.correlation)
         except MeshFailed:
             continue
         if claimed > settings.check_steps:
@@ -354,6 +354,7 @@ def _check_by_walks(
             settings.check_walks,
             settings.seed,
             mu_s=settings.mu_s,
+            correlation=settings.correlation,
             model=settings.model,
             state=cycle.state,
             max_steps=int(20 * settings.check_steps),

@@ -14,7 +14,7 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.models import model_from, model_values
 from biped_mfpt_ros.optimise.searchers import SEARCHERS
 from biped_mfpt_ros.walker.robot import WalkerModel
-from biped_mfpt_ros.walker.terrain import slope_set
+from biped_mfpt_ros.walker.terrain import check_correlation, slope_set
 
 OBJECTIVES = {
     "mfpt": "log10 of the mean first-passage time at sigma_s, steps; more is better",
@@ -98,6 +98,8 @@ class StudySettings:
         What walks.
     mu_s, sigma_s : float
         rad, mean and standard deviation of the slope at which MFPT is taken.
+    correlation : float
+        Of each slope with the one before.
     slope_limit_deg : float
         Steepest slope of the sets.
     stages : tuple of Stage
@@ -133,6 +135,7 @@ class StudySettings:
     model: WalkerModel = field(default_factory=WalkerModel)
     mu_s: float = 0.0
     sigma_s: float = math.radians(1.0)
+    correlation: float = 0.0
     slope_limit_deg: float = 20.0
     stages: tuple[Stage, ...] = DEFAULT_STAGES
     check_sigmas: tuple[float, ...] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0)
@@ -165,6 +168,7 @@ class StudySettings:
         _check("candidates", self.candidates, bool(self.candidates) == given,
                "at least one for the searcher given, none for others")  # fmt: skip
         _check("sigma_s", self.sigma_s, 0.0 < self.sigma_s < math.inf, "> 0 rad")
+        check_correlation(self.correlation)
         _check("stages", self.stages, bool(self.stages), "at least one mesh")
         for stage in self.stages:
             slopes = slope_set(stage.slope_step_deg, self.slope_limit_deg)
@@ -195,9 +199,10 @@ class StudySettings:
         out["start"] = start | {"parameters": self.start.parameters.tolist()}
         out["model"] = {name: _text(value) for name, value in model_values(self.model).items()}
         out["stages"] = [{k: _text(v) for k, v in asdict(s).items()} for s in self.stages]
-        # A study that was begun before there were candidates, or several runs, goes on.
-        if not self.candidates:
-            del out["candidates"]
+        # A study that was begun before there were these goes on.
+        for name in ("candidates", "correlation"):
+            if not out[name]:
+                del out[name]
         if (count := self.run_count) > 1:
             out["runs"] = count
         else:

@@ -87,17 +87,18 @@ def front(studies: Sequence[Study], paper: bool = True) -> Picture:
     Parameters
     ----------
     studies : sequence of Study
-        All at the same sigma_s.
+        All on the same ground: mean, sigma_s and correlation of the slopes.
     paper : bool, optional
         Whether the paper's controllers are marked, which takes a mesh of each.
 
     Raises
     ------
     ValueError
-        If the studies are of different sigma_s.
+        If the studies are of different ground.
     """
     settings = studies[0].settings
-    if len({(s.settings.mu_s, s.settings.sigma_s) for s in studies}) > 1:
+    grounds = {(s.settings.mu_s, s.settings.sigma_s, s.settings.correlation) for s in studies}
+    if len(grounds) > 1:
         raise ValueError("studies of different slope distributions do not make one front")
     confirmed: dict[str, list[dict[str, float]]] = {}
     for study in studies:
@@ -201,7 +202,7 @@ def paper_points(settings: StudySettings) -> dict[str, tuple[float, float]]:
                 mu_s=settings.mu_s, sigma_s=settings.sigma_s,
             )  # fmt: skip
             mesh = LocalBackend().grow(cycle, mine, stage, mine.slopes[0], lambda: None)
-            mfpt = mesh.mfpt(settings.mu_s, settings.sigma_s)
+            mfpt = mesh.mfpt(settings.mu_s, settings.sigma_s, settings.correlation)
         except (NoLimitCycle, MeshFailed):
             continue
         if np.isfinite(mfpt):

@@ -110,6 +110,13 @@ examples:
         "--mean", type=number, default=0.0, metavar="DEG", help="degrees, mean slope (default: 0)"
     )
     optimise.add_argument(
+        "--correlation",
+        type=number,
+        default=0.0,
+        metavar="R",
+        help="of each slope with the one before (default: 0, independent slopes)",
+    )
+    optimise.add_argument(
         "--mesh",
         type=typed(_mesh_stage, "D_S:D_THR, D_S:D_THR:MARGIN or D_S:D_THR:MARGIN:MAX_STATES"),
         nargs="+",
