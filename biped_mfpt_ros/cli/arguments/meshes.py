@@ -84,7 +84,7 @@ deviations costs one mesh. In this process, without ROS.
 examples:
   biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --slope-step 0.5 --threshold 0.3
   biped-mfpt mfpt --controller hzd/cot --sigma 0.5 1 1.5 2 --mean -1 --json
-  biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --correlation 0.8   rolling ground
+  biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --correlation 0.8
 """,
         "walker",
         "mesh",
