@@ -97,6 +97,11 @@ def test_no_cycle_is_an_error_that_says_how_it_ended():
         find_limit_cycle(controller("hzd/base"), math.radians(-5.0))
 
 
+def test_a_cycle_on_a_slope_beyond_the_limit_is_refused():
+    with pytest.raises(InputError, match=r"^slope: 0\.8 is not allowed"):
+        find_limit_cycle(controller("hzd/base"), 0.8)
+
+
 def test_a_search_that_crawls_is_given_up(monkeypatch):
     monkeypatch.setattr("biped_mfpt_ros.gait.cycle._MOST_EVALUATIONS", 500_000)
     parameters = controller("hzd/base").parameters.copy()

@@ -488,6 +488,11 @@ def test_candidates_are_those_of_the_space(tmp_path):
     store.close()
 
 
+def test_a_study_without_workers_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"^workers: 0"):
+        run(tmp_path / "s.sqlite", workers=0)
+
+
 def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
     settings = StudySettings(
         controller("hzd/mfpt"), "nsga2", fixed=("k?",), objectives={"mfpt": 1.0, "cot": 20.0},

@@ -313,7 +313,7 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     Raises
     ------
     InputError
-        If a k_i or tau_i is not positive, or an alpha_i is not between 0 and 1.
+        If a k_i or tau_i is not positive, or an alpha_i is not from 0.25 to 1.
     """
     named = dict(zip(PARAMETERS, parameters.tolist(), strict=True))
     for name, value in named.items():

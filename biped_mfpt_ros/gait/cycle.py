@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
+from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.step import Steps, check_states, simulate_steps
 from biped_mfpt_ros.walker.outcome import Outcome
-from biped_mfpt_ros.walker.robot import STATE_SIZE, WalkerModel
+from biped_mfpt_ros.walker.robot import STATE_SIZE, Robot, WalkerModel
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
 
 # Rates at which the search starts, rad/s. The paper's cycles lie between 1 and 3.
 _START_RATES = np.linspace(0.4, 4.0, 37)
@@ -71,6 +73,47 @@ class LimitCycle:
         return bool(abs(self.eigenvalues[0]) < 1.0)
 
 
+def limit_cycle_of(
+    controller: Controller,
+    slope: float,
+    state: np.ndarray,
+    steps: Steps,
+    jacobian: np.ndarray,
+    robot: Robot,
+    residual: float,
+) -> LimitCycle:
+    """The limit cycle at a fixed point of the step map.
+
+    Parameters
+    ----------
+    controller, slope, state, residual
+        As in `LimitCycle`.
+    steps : Steps
+        The one step from the state, with its measures.
+    jacobian : numpy.ndarray
+        Of the step map at the state, shape (10, 10).
+    robot : Robot
+        The links.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the eigenvalues of the Jacobian are not found.
+    """
+    length = float(steps.step_lengths[0, 0])
+    eigenvalues = np.linalg.eigvals(jacobian)
+    return LimitCycle(
+        controller=controller,
+        slope=slope,
+        state=state,
+        period=float(steps.durations[0, 0]),
+        step_length=length,
+        cost_of_transport=float(steps.energies[0, 0]) / (robot.mass * robot.gravity * length),
+        eigenvalues=eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")],
+        residual=residual,
+    )
+
+
 def find_limit_cycle(
     controller: Controller,
     slope: float = 0.0,
@@ -107,6 +150,8 @@ def find_limit_cycle(
     InputError
         If slope or guess is not allowed.
     """
+    if not abs(slope) <= SLOPE_LIMIT:
+        raise InputError("slope", slope, f"within {SLOPE_LIMIT:.4f} rad")
     model = model or WalkerModel()
     model = replace(model, tolerance=min(model.tolerance, _TOLERANCE))
     if guess is None:
@@ -188,20 +233,10 @@ def _newton(search: _Search, state: np.ndarray) -> LimitCycle | None:
         size = np.abs(value).max()
         if size < _RESIDUAL:
             steps = search.steps(state[None], slope)
-            length = float(steps.step_lengths[0, 0])
-            weight = robot.mass * robot.gravity
-            eigenvalues = np.linalg.eigvals(jacobian + np.eye(STATE_SIZE))
-            order = np.argsort(-np.abs(eigenvalues), kind="stable")
-            return LimitCycle(
-                controller=search.controller,
-                slope=slope,
-                state=state,
-                period=float(steps.durations[0, 0]),
-                step_length=length,
-                cost_of_transport=float(steps.energies[0, 0]) / (weight * length),
-                eigenvalues=eigenvalues[order],
-                residual=float(size),
-            )
+            return limit_cycle_of(
+                search.controller, slope, state, steps, jacobian + np.eye(STATE_SIZE), robot,
+                float(size),
+            )  # fmt: skip
         try:
             move = np.linalg.solve(jacobian, -value[0])
         except np.linalg.LinAlgError:

@@ -60,7 +60,6 @@ STAGES = 12
 """Evaluations of a step: the last, at its end, is the next step's first."""
 DENSE_STAGES = 3
 """Further evaluations for the dense output."""
-ORDER = 8
 POWER_STAGES = (5, 9, 10, STAGES)
 """Stages, after the first, at whose powers a step is searched for changes of their signs."""
 

@@ -319,11 +319,12 @@ def fill_response(response: SimulateSteps.Response, steps: Steps) -> None:
 def steps_from(response: SimulateSteps.Response, n: int, m: int) -> Steps:
     """Steps of an answer to a request of n states and m slopes, checked.
 
+    Measures that were not asked for have shape (0, m).
+
     Raises
     ------
     InputError
-        If a length does not fit, or a value cannot be a step's. Measures that were not asked for
-        have shape (0, m).
+        If a length does not fit, or a value cannot be a step's.
     """
     outcomes = unpacked(response.outcomes, "B")
     if outcomes.size != n * m:

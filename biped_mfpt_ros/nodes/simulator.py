@@ -25,7 +25,7 @@ from biped_mfpt_ros.nodes.spin import run_node
 from biped_mfpt_ros.nodes.warm_up import compiled
 
 MOST_WAITING = 64
-"""Requests that wait. A mesher has two at once; a request may have some 0.4 MB, and take 2 s."""
+"""Requests that wait. A mesher has two at once; a request may have some 0.4 MB, and take 0.4 s."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,11 @@ class SimulatorParameters(NodeParameters):
     max_outcomes: int = parameter(
         1_000_000, "most outcomes (states times slopes) in one request", 1, 100_000_000
     )
-    # 4096 swings of the paper's gaits take 3.3 million. A swing that crawls takes half a million.
+    # 4096 swings of the paper's HZD gaits take up to 1.7 million, of its sliding-mode ones 4 to 15
+    # million, and a swing that crawls half a million.
     max_evaluations: int = parameter(
         4_000_000,
-        "evaluations of the closed loop (0.5 us each), after which a request is answered for the "
+        "evaluations of the closed loop (0.1 us each), after which a request is answered for the "
         "states simulated until then, at least one",
         1,
         1_000_000_000_000,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from biped_mfpt_ros.control.controller import Controller
-from biped_mfpt_ros.gait.cycle import LimitCycle
+from biped_mfpt_ros.gait.cycle import LimitCycle, limit_cycle_of
 from biped_mfpt_ros.gait.step import Steps
 from biped_mfpt_ros.gait.trace import trace_swing
 from biped_mfpt_ros.walker.outcome import Outcome
@@ -156,7 +156,12 @@ def _refined(
                 slope = jacobian()
                 if slope is None:
                     return None
-            return _cycle(controller, model, state, steps, slope, float(size))
+            try:
+                return limit_cycle_of(
+                    controller, 0.0, state, steps, slope, model.robot, float(size)
+                )
+            except np.linalg.LinAlgError:
+                return None
         try:
             move = np.linalg.solve(slope - np.eye(STATE_SIZE), -residual)
         except np.linalg.LinAlgError:
@@ -184,33 +189,6 @@ def _refined(
             if slope is None:
                 return None
     return None
-
-
-def _cycle(
-    controller: Controller,
-    model: WalkerModel,
-    state: np.ndarray,
-    steps: Steps,
-    slope: np.ndarray,
-    residual: float,
-) -> LimitCycle | None:
-    """A limit cycle with what its step tells; None if its Jacobian has no eigenvalues."""
-    length = float(steps.step_lengths[0, 0])
-    try:
-        eigenvalues = np.linalg.eigvals(slope)
-    except np.linalg.LinAlgError:
-        return None
-    return LimitCycle(
-        controller=controller,
-        slope=0.0,
-        state=state,
-        period=float(steps.durations[0, 0]),
-        step_length=length,
-        cost_of_transport=float(steps.energies[0, 0])
-        / (model.robot.mass * model.robot.gravity * length),
-        eigenvalues=eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")],
-        residual=residual,
-    )
 
 
 def _measured(cycle: LimitCycle, model: WalkerModel) -> FlatGait:

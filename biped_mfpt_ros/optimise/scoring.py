@@ -83,11 +83,11 @@ class GrownMesh(Protocol):
 
     @property
     def seconds(self) -> float:
-        """s, wall time."""
+        """Wall time, s."""
 
     @property
     def step_map_seconds(self) -> float:
-        """S in the step map, summed over who worked on it."""
+        """Time in the step map, summed over who worked on it, s."""
 
     def mfpt(self, mu_s: float, sigma_s: float, correlation: float) -> float:
         """MFPT in steps; MeshFailed if its chain cannot be solved."""

@@ -81,11 +81,11 @@ class StudySettings:
     seed : int
         Of the search, >= 0.
     step : float
-        First step of the search, as a multiple of the scales of the space.
+        First step of the search, as a multiple of the scales of the space, > 0.
     population : int
-        Candidates in a generation; 0: the searcher's own.
+        Candidates in a generation, 2 to 100000; 0: the searcher's own.
     runs : int
-        How many the search begins with, for ``cma-es`` alone; 0: its own choice.
+        How many the search begins with, up to 1000, for ``cma-es`` alone; 0: its own choice.
     fixed : tuple of str
         Patterns of coordinates that are not searched.
     candidates : tuple of tuple of float
@@ -93,7 +93,7 @@ class StudySettings:
     objectives : dict
         Names of `OBJECTIVES` with their weights in the score, > 0.
     limits : dict
-        Names of `LIMITS` with their values.
+        Names of `LIMITS` with their values, >= 0.
     model : WalkerModel
         What walks.
     mu_s, sigma_s : float
@@ -101,17 +101,17 @@ class StudySettings:
     correlation : float
         Of each slope with the one before.
     slope_limit_deg : float
-        Steepest slope of the sets.
+        Steepest slope of the sets, degrees.
     stages : tuple of Stage
         Meshes, coarse to fine. The last one confirms.
     check_sigmas : tuple of float
         Multiples of sigma_s: at the least of them at which the confirming mesh gives no more than
         ``check_steps`` steps, Monte Carlo has to agree. Empty: no such check.
     check_steps : float
-        See there. As many as walks can afford, since walks at a larger sigma do not tell all: a
-        mesh claimed 85 steps where walks at that sigma took 12.
+        See there, >= 1. As many as walks can afford, since walks at a larger sigma do not tell all:
+        a mesh may claim 85 steps where walks at that sigma take 12.
     check_walks : int
-        Walks of that check.
+        Walks of that check, >= 1.
     trial_seconds : float
         s, after which a trial is given up. It keeps what it has: a safety net, far above what a
         trial takes, since what it cuts off depends on the machine.

@@ -130,7 +130,7 @@ class Study:
         backend : Backend
             Who grows meshes.
         workers : int, optional
-            Trials at the same time, each in a thread.
+            Trials at the same time, each in a thread; >= 1.
         trials : int, optional
             Until the study has so many.
         seconds : float, optional
@@ -147,9 +147,13 @@ class Study:
 
         Raises
         ------
+        InputError
+            If there are no workers.
         BackendLost
             If the backend is lost again and again. The trials are given back.
         """
+        if workers < 1:
+            raise InputError("workers", workers, ">= 1")
         stop = stop or threading.Event()
         ended = threading.Event()
         deadline = math.inf if seconds is None else time.monotonic() + seconds

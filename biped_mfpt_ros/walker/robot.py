@@ -31,8 +31,6 @@ import numpy as np
 from biped_mfpt_ros.errors import InputError
 
 STATE_SIZE = 10
-JOINTS = 4
-"""Actuated joints: q1 to q4."""
 
 # a = ABSOLUTE @ q, and for the rates alike.
 ABSOLUTE = np.array(
@@ -45,7 +43,7 @@ ABSOLUTE = np.array(
     ]
 )
 
-# Offsets into the packed robot (Robot.packed), as the kernels read it.
+# Offsets into the packed model (WalkerModel.packed), as the kernels read it.
 C = 0  # 25: C_ij, inertia matrix D_ij = C_ij cos(a_i - a_j) + I_i delta_ij
 I_LINK = 25  # 5: I_i, about each link's own centre of mass
 W = 30  # 5: w_i = sum_k m_k c_ki, centre of mass of the whole times the mass
@@ -54,15 +52,13 @@ GRAVITY = 36
 FEMUR = 37  # length
 TIBIA = 38  # length
 TORSO = 39  # length
-C_NEW = 40  # 25: as C, with the swing foot at rest instead of the stance foot
-K_NEW = 65  # 25: momentum about the swing foot, see impact.py
-TORQUE_LIMIT = 90
-FRICTION = 91
-SLIP_DURATION = 92
-TIME_LIMIT = 93
-TOLERANCE = 94
-VERTICAL_FRICTION = 95  # 1: friction at impact is judged against the vertical
-PACKED_SIZE = 96
+TORQUE_LIMIT = 40
+FRICTION = 41
+SLIP_DURATION = 42
+TIME_LIMIT = 43
+TOLERANCE = 44
+VERTICAL_FRICTION = 45  # 1: friction at impact is judged against the vertical
+PACKED_SIZE = 46
 
 FRICTION_FRAMES = ("slope", "vertical")
 """Allowed values of `WalkerModel.friction_frame`."""
@@ -248,20 +244,15 @@ class WalkerModel:
         """All constants as the kernels read them: float64, shape (PACKED_SIZE,)."""
         robot = self.robot
         masses, position = robot.link_masses, robot.link_positions
-        foot = robot.swing_foot_position
-        inertias = robot.link_inertias
         out = np.empty(PACKED_SIZE)
         out[C : C + 25] = np.einsum("k,ki,kj->ij", masses, position, position).ravel()
-        out[I_LINK : I_LINK + 5] = inertias
+        out[I_LINK : I_LINK + 5] = robot.link_inertias
         out[W : W + 5] = masses @ position
         out[MASS] = robot.mass
         out[GRAVITY] = robot.gravity
         out[FEMUR] = robot.femur_length
         out[TIBIA] = robot.tibia_length
         out[TORSO] = robot.torso_length
-        about_foot = position - foot
-        out[C_NEW : C_NEW + 25] = np.einsum("k,ki,kj->ij", masses, about_foot, about_foot).ravel()
-        out[K_NEW : K_NEW + 25] = np.einsum("k,ki,kj->ij", masses, about_foot, position).ravel()
         out[TORQUE_LIMIT] = self.torque_limit
         out[FRICTION] = min(self.friction, 1e12)  # keeps its product with a zero force finite
         out[SLIP_DURATION] = self.slip_duration
