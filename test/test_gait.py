@@ -160,6 +160,7 @@ def test_walks_that_do_not_fall_are_stopped_and_counted_as_such():
         ({"walks": 0}, "walks"),
         ({"seed": -1}, "seed"),
         ({"max_steps": 0}, "max_steps"),
+        ({"threads": 0}, "threads"),
         ({"mu_s": 2.0}, "mu_s"),
         ({"state": np.zeros(9)}, "state"),
     ],

@@ -13,7 +13,7 @@ from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.report.progress import duration_text
-from biped_mfpt_ros.report.tables import table
+from biped_mfpt_ros.report.tables import plural, table
 
 if TYPE_CHECKING:
     from biped_mfpt_ros.bag.report import BagReport, MeshReport
@@ -36,8 +36,8 @@ def inspect(args: argparse.Namespace) -> int:
     else:
         saved = salvage(args.bag, args.repair)
         if not args.quiet:
-            count = sum(saved.counts.values())
-            print(f"saved {count} messages of {saved.source} in {saved.path}", file=sys.stderr)
+            count = plural(sum(saved.counts.values()), "message")
+            print(f"saved {count} of {saved.source} in {saved.path}", file=sys.stderr)
         report = inspect_bag(saved.path, sigmas, mean, args.correlation)
         report.problems[:0] = [f"not saved of {saved.source}: {text}" for text in saved.missing]
     print(json_text(report.to_dict()) if args.json else _text(report))
@@ -47,7 +47,7 @@ def inspect(args: argparse.Namespace) -> int:
 def _text(report: BagReport) -> str:
     recorded = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(report.start))
     parts = [
-        f"{report.path}: {report.messages} messages in {duration_text(report.duration)}, "
+        f"{report.path}: {plural(report.messages, 'message')} in {duration_text(report.duration)}, "
         f"{report.bytes / 1e6:.3g} MB, recorded {recorded}",
         table(
             ("topic", "messages", "missing", "repeated"),
@@ -65,8 +65,9 @@ def _mesh_text(mesh: MeshReport) -> str:
     if mesh.problem:
         return f"{parts[0]}, cannot be rebuilt: {mesh.problem}"
     parts.append(
-        f"{mesh.controller}, {mesh.states} states in {mesh.generations} generations, "
-        f"{mesh.slopes} slopes, threshold {mesh.threshold:g}"
+        f"{mesh.controller}, {plural(mesh.states, 'state')} in "
+        f"{plural(mesh.generations, 'generation')}, "
+        f"{plural(mesh.slopes, 'slope')}, threshold {mesh.threshold:g}"
         f"{'' if mesh.clustered else ', unclustered'}, {duration_text(mesh.seconds)}"
     )
     rows = [

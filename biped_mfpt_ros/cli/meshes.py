@@ -19,6 +19,7 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.files import whole_file
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.report.progress import duration_text
+from biped_mfpt_ros.report.tables import plural
 
 _MESH_ARRAYS = (
     "slopes", "states", "preceding", "generation", "targets", "outcomes", "scales",
@@ -110,6 +111,7 @@ def grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:
 
 def _mesh_text(result: dict[str, Any]) -> str:
     return (
-        f"{result['controller']}: {result['states']} states in {result['generations']} "
-        f"generations, {result['slopes']} slopes, {duration_text(result['seconds'])}"
+        f"{result['controller']}: {plural(result['states'], 'state')} in "
+        f"{plural(result['generations'], 'generation')}, "
+        f"{plural(result['slopes'], 'slope')}, {duration_text(result['seconds'])}"
     )

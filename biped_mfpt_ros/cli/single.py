@@ -24,7 +24,7 @@ from biped_mfpt_ros.gait.step import check_states, simulate_steps
 from biped_mfpt_ros.models import robot_from_file
 from biped_mfpt_ros.optimise.space import PARAMETRISATIONS
 from biped_mfpt_ros.report import paper
-from biped_mfpt_ros.report.tables import number, table
+from biped_mfpt_ros.report.tables import number, plural, table
 from biped_mfpt_ros.walker.outcome import Outcome
 
 
@@ -128,13 +128,14 @@ def monte_carlo(args: argparse.Namespace) -> None:
         )
         return
     low, high = result.confidence_interval
+    confidence = f", 95 % confidence {number(low)} to {number(high)}" if result.falls > 1 else ""
     print(
         f"{controller.name}: {number(result.mean_steps)} steps to a fall on average"
-        f"{_beside(reference)}, 95 % confidence {number(low)} to {number(high)}"
+        f"{_beside(reference)}{confidence}"
     )
     print(
-        f"{args.walks} walks, {result.counted.size} counted (more than one step), "
-        f"{result.falls} falls"
+        f"{plural(args.walks, 'walk')}, {result.counted.size} counted (more than one step), "
+        f"{plural(result.falls, 'fall')}"
     )
     print(shares_table(result.failure_shares))
 

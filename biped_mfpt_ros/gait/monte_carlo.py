@@ -23,7 +23,7 @@ from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
-from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, check_correlation, deviations
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, check_distribution, deviations
 
 _BLOCK_WALKS = 64  # walks in a job: some ten milliseconds of work
 _STEP = int(Outcome.STEP)
@@ -167,7 +167,7 @@ def monte_carlo(
     sigma_s : float
         rad, standard deviation of the slope, > 0.
     walks : int
-        How many walks.
+        How many walks, >= 1.
     seed : int
         Of all walks, >= 0.
     mu_s : float, optional
@@ -183,9 +183,9 @@ def monte_carlo(
         ``[q, dq]`` after an impact on flat ground, shape (10,), where every walk starts; the limit
         cycle on flat ground by default.
     max_steps : int, optional
-        Walks that have not fallen after so many steps are stopped.
+        Walks that have not fallen after so many steps are stopped; >= 1.
     threads : int, optional
-        One per core by default.
+        >= 1; one per core by default.
     progress : callable, optional
         Called with the walks ended and all walks, now and then.
 
@@ -203,13 +203,9 @@ def monte_carlo(
         If no state is given and no limit cycle is found.
     """
     model = model or WalkerModel()
-    if not (math.isfinite(sigma_s) and sigma_s > 0.0):
-        raise InputError("sigma_s", sigma_s, "finite, > 0 rad")
-    if not abs(mu_s) <= SLOPE_LIMIT:
-        raise InputError("mu_s", mu_s, f"within {SLOPE_LIMIT:.4f} rad")
-    check_correlation(correlation)
-    for name, value in (("walks", walks), ("max_steps", max_steps)):
-        if value < 1:
+    check_distribution(mu_s, sigma_s, correlation)
+    for name, value in (("walks", walks), ("max_steps", max_steps), ("threads", threads)):
+        if value is not None and value < 1:
             raise InputError(name, value, ">= 1")
     if seed < 0:
         raise InputError("seed", seed, ">= 0")

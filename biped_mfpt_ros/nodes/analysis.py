@@ -154,7 +154,9 @@ class Analysis(Node):
             found = self._solve(mesh_id, known, mu_s, sigmas, parameters.correlation)
             for sigma_deg, estimate in zip(parameters.sigma_s_deg, found, strict=True):
                 if isinstance(estimate, ChainError):
-                    self.get_logger().error(f"{mesh_id}: no MFPT at {sigma_deg:g}: {estimate}")
+                    self.get_logger().error(
+                        f"{mesh_id}: no MFPT at sigma_s {sigma_deg:g} degrees: {estimate}"
+                    )
                     continue
                 self._estimates.publish(estimate)
                 self.get_logger().info(

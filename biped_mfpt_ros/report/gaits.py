@@ -43,7 +43,7 @@ from biped_mfpt_ros.report.style import (
 from biped_mfpt_ros.report.tables import correlation_text
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import WalkerModel
-from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, check_correlation, deviations
+from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT, check_distribution, deviations
 
 FRAME_INTERVAL = 0.05
 """s between the frames of an animation: 20 a second, in real time."""
@@ -165,11 +165,7 @@ def rough_walk(
         If no state is given and no limit cycle is found.
     """
     model = model or WalkerModel()
-    if not (math.isfinite(sigma_s) and sigma_s > 0.0):
-        raise InputError("sigma_s", sigma_s, "finite, > 0 rad")
-    if not abs(mu_s) <= SLOPE_LIMIT:
-        raise InputError("mu_s", mu_s, f"within {SLOPE_LIMIT:.4f} rad")
-    check_correlation(correlation)
+    check_distribution(mu_s, sigma_s, correlation)
     for name, value, least in (
         ("seed", seed, 0),
         ("number", number, 0),

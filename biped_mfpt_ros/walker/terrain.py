@@ -94,6 +94,30 @@ def check_correlation(correlation: float) -> float:
     return float(correlation)
 
 
+def check_distribution(mu_s: float, sigma_s: float, correlation: float) -> None:
+    """Check the distribution of slopes that walks draw from.
+
+    Parameters
+    ----------
+    mu_s : float
+        rad, mean, within `SLOPE_LIMIT`.
+    sigma_s : float
+        rad, standard deviation, > 0.
+    correlation : float
+        As for `check_correlation`.
+
+    Raises
+    ------
+    InputError
+        If one of these does not hold.
+    """
+    if not (math.isfinite(sigma_s) and sigma_s > 0.0):
+        raise InputError("sigma_s", sigma_s, "finite, > 0 rad")
+    if not abs(mu_s) <= SLOPE_LIMIT:
+        raise InputError("mu_s", mu_s, f"within {SLOPE_LIMIT:.4f} rad")
+    check_correlation(correlation)
+
+
 def spread_given_last(sigma_s: float, correlation: float) -> float:
     """Standard deviation of the slope when the one before is known, rad; of all slopes sigma_s."""
     return sigma_s * math.sqrt((1.0 - correlation) * (1.0 + correlation))
