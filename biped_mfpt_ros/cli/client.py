@@ -205,8 +205,8 @@ class Client:
         mesh_id: str,
         mu_s: float,
         sigma_s: Sequence[float],
-        correlation: float,
         timeout: float,
+        correlation: float = 0.0,
     ) -> list[MfptEstimate]:
         """The MFPT of a mesh as the analysis publishes it, one for each ``sigma_s``."""
 

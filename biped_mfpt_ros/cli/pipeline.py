@@ -295,7 +295,7 @@ class Pipeline:
                     client.wait(partial(client.reaches, name), START_TIMEOUT, name)
             self._progress.show("waiting for the analysis")
             estimates = client.published_mfpt(
-                grown.mesh_id, mean, list(sigmas), correlation, RESULT_TIMEOUT
+                grown.mesh_id, mean, list(sigmas), RESULT_TIMEOUT, correlation
             )
             low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)
             curve = client.compute_mfpt(

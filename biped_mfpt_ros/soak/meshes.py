@@ -68,7 +68,7 @@ def run(short: bool, seed: int, progress: Progress) -> list[Row]:
                 threshold = 1.0 if i % 2 == 0 else float(random.uniform(0.8, 3.0))
                 before = time.monotonic()
                 grown = client.grow_mesh(_settings(threshold), lambda message: None)
-                found = client.published_mfpt(grown.mesh_id, 0.0, [np.radians(1.0)], 0.0, 60.0)
+                found = client.published_mfpt(grown.mesh_id, 0.0, [np.radians(1.0)], 60.0)
                 seconds[i] = time.monotonic() - before
                 if i % 2 == 0:
                     estimates.add(found[0].mfpt)
