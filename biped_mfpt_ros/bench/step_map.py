@@ -54,6 +54,24 @@ def reached(
     return state, steps.next_states, SLOPES[steps.outcomes[0] == Outcome.STEP]
 
 
+def starts_of(name: str, flat: bool) -> tuple[Controller, WalkerModel, np.ndarray, np.ndarray]:
+    """Controller, model, and the states that are timed with the slopes behind them.
+
+    All that a step from the flat cycle leads to, or with ``flat`` the flat cycle's alone: of the
+    others some fall at once, which costs more for each second of motion.
+    """
+    control, model = controller(name), readings()[name].model
+    state, states, previous = reached(control, model)
+    if flat:
+        return control, model, state[None], np.zeros(1)
+    return control, model, states, previous
+
+
+def labelled(name: str, flat: bool) -> str:
+    """How the figures of such swings are called."""
+    return f"{name}, flat cycle" if flat else name
+
+
 def _padded(steps: Steps) -> np.ndarray:
     """States after impact with a place for every slope, shape (n, m, 10)."""
     out = np.zeros((*steps.outcomes.shape, 10))
@@ -62,14 +80,13 @@ def _padded(steps: Steps) -> np.ndarray:
 
 
 def step_map(
-    name: str, repetitions: int
+    name: str, repetitions: int, flat: bool
 ) -> tuple[list[dict[str, Any]], dict[str, Any], dict[bool, float]]:
     """One swing for all 81 slopes, with a check against a tolerance of 1e-12.
 
     Returns rows, facts, and the median seconds of a swing, without and with measures.
     """
-    control, model = controller(name), readings()[name].model
-    _, states, previous = reached(control, model)
+    control, model, states, previous = starts_of(name, flat)
     # About as many as in a request of a large mesh: lanes are idle only as a batch ends.
     copies = 1 + _SWINGS // len(states)
     states, previous = np.tile(states, (copies, 1)), np.tile(previous, copies)
@@ -89,6 +106,7 @@ def step_map(
     seconds = timed(lambda: swings(model), repetitions)
     measured = timed(lambda: swings(model, True), repetitions)
     n = len(states)
+    name = labelled(name, flat)
     rows = [
         row(f"{name}: swing, 81 slopes", seconds, n, "us"),
         row(f"{name}: with durations, step lengths, energies", measured, n, "us"),
@@ -112,7 +130,7 @@ def cycle_of(name: str) -> tuple[Controller, WalkerModel, np.ndarray]:
 
 
 def swings_of(
-    name: str,
+    name: str, flat: bool = False
 ) -> tuple[Controller, WalkerModel, np.ndarray, np.ndarray, np.ndarray]:
     """The swings that `step_map` times, each down to its last impact, or to its fall.
 
@@ -124,8 +142,7 @@ def swings_of(
         Controller, model, states just after impact and at the end, in absolute angles (rad,
         rad/s), shape (n, 10) each, and durations (s), shape (n,).
     """
-    control, model = controller(name), readings()[name].model
-    _, states, previous = reached(control, model)
+    control, model, states, previous = starts_of(name, flat)
     durations = simulate_steps(control, states, previous, SLOPES, model).durations
     begun = durations.max(axis=1) > 0.0
     states, previous, durations = states[begun], previous[begun], durations[begun]
@@ -161,13 +178,15 @@ def _right_side(
     return derivative
 
 
-def scipy_swings(name: str, repetitions: int, energy: bool) -> tuple[np.ndarray, int, float]:
+def scipy_swings(
+    name: str, repetitions: int, energy: bool, flat: bool = False
+) -> tuple[np.ndarray, int, float]:
     """Seconds of scipy's RK45 at rtol 1e-6 for the swings timed, on the same compiled right side.
 
     Also how many swings these are, and the greatest error at their ends, rad or rad/s. With the
     energy it has kinks to step over, wherever a joint's power changes its sign.
     """
-    control, model, starts, ends, durations = swings_of(name)
+    control, model, starts, ends, durations = swings_of(name, flat)
     columns = 11 if energy else 10
     derivative = _right_side(control, model, columns)
     starts = np.column_stack([starts, np.zeros(len(starts))])[:, :columns]  # none spent yet
@@ -242,12 +261,12 @@ def rigid_body_error(name: str) -> list[float]:
     return errors
 
 
-def rigid_body_swings(name: str, repetitions: int) -> tuple[np.ndarray, int]:
+def rigid_body_swings(name: str, repetitions: int, flat: bool) -> tuple[np.ndarray, int]:
     """Seconds of MuJoCo for the swings timed at steps of 1 ms, their torques already computed.
 
     Durations are rounded up to whole steps. Also how many swings these are.
     """
-    control, model, starts, _, durations = swings_of(name)
+    control, model, starts, _, durations = swings_of(name, flat)
     rob, par = model.packed(), control.packed(model.robot)
     work, rate, applied = empty_scratch(), np.empty(11), np.empty(4)
 
@@ -313,37 +332,45 @@ def run(short: bool) -> Section:
     section = Section()
     medians = {}
     for name in paper_controller_names():
-        rows, facts, medians[name] = step_map(name, repetitions)
-        section.rows.extend(rows)
-        section.facts.update(facts)
+        for flat in (False, True) if name.startswith("hzd/") else (False,):
+            rows, facts, medians[name, flat] = step_map(name, repetitions, flat)
+            section.rows.extend(rows)
+            section.facts.update(facts)
     rows, facts, section.ratios["evaluation_over_floor"] = floor(repetitions)
     section.rows.extend(rows)
     section.facts.update(facts)
     for label in ("base", "cot", "mfpt"):
-        name = f"hzd/{label}"
-        for energy, what in ((False, name), (True, f"{name}, energies")):
-            seconds, n, error = scipy_swings(name, repetitions, energy)
-            section.rows.append(row(f"{what}: swing by scipy RK45, rtol 1e-6", seconds, n, "us"))
-            section.facts[f"{what}: error of scipy RK45"] = error
-            ratio = float(np.median(seconds)) / n / medians[name][energy]
-            section.ratios[f"scipy_over_step_map: {what}"] = ratio
+        hzd, smc = f"hzd/{label}", f"smc/{label}"
+        for flat in (False, True):
+            _compare(section, hzd, flat, medians[hzd, flat], repetitions)
         if rigid_body.mujoco is None:
             section.facts["MuJoCo"] = "not installed: pip install -r requirements/bench.txt"
         else:
-            errors = rigid_body_error(name)
-            seconds, n = rigid_body_swings(name, repetitions)
-            section.rows.append(row(f"{name}: swing by MuJoCo, 1 ms", seconds, n, "us"))
-            ratio = float(np.median(seconds)) / n / medians[name][False]
-            section.ratios[f"rigid_body_engine_over_step_map: {name}"] = ratio
-            section.facts[f"{name}: error of MuJoCo at 1, 1/2, 1/4 ms"] = errors
-        ratio = medians[f"smc/{label}"][False] / medians[name][False]
+            section.facts[f"{hzd}: error of MuJoCo at 1, 1/2, 1/4 ms"] = rigid_body_error(hzd)
+        ratio = medians[smc, False][False] / medians[hzd, False][False]
         section.ratios[f"smc_over_hzd: {label}"] = ratio
         stiff = {}
-        for scheme in ("hzd", "smc"):
-            one = f"{scheme}/{label}"
-            stiff[scheme], error = stiff_evaluations(one)
-            section.facts[f"{one}: evaluations a swing of scipy LSODA, rtol 1e-6"] = stiff[scheme]
+        for one in (hzd, smc):
+            stiff[one], error = stiff_evaluations(one)
+            section.facts[f"{one}: evaluations a swing of scipy LSODA, rtol 1e-6"] = stiff[one]
             section.facts[f"{one}: error of scipy LSODA"] = error
-        ratio = stiff["smc"] / stiff["hzd"]
-        section.ratios[f"lsoda_evaluations_smc_over_hzd: {label}"] = ratio
+        section.ratios[f"lsoda_evaluations_smc_over_hzd: {label}"] = stiff[smc] / stiff[hzd]
     return section
+
+
+def _compare(
+    section: Section, name: str, flat: bool, medians: dict[bool, float], repetitions: int
+) -> None:
+    """Others beside the step map, which takes ``medians`` (s) without and with measures."""
+    label = labelled(name, flat)
+    for energy, what in ((False, label), (True, f"{label}, energies")):
+        seconds, n, error = scipy_swings(name, repetitions, energy, flat)
+        section.rows.append(row(f"{what}: swing by scipy RK45, rtol 1e-6", seconds, n, "us"))
+        section.facts[f"{what}: error of scipy RK45"] = error
+        ratio = float(np.median(seconds)) / n / medians[energy]
+        section.ratios[f"scipy_over_step_map: {what}"] = ratio
+    if rigid_body.mujoco is not None:
+        seconds, n = rigid_body_swings(name, repetitions, flat)
+        section.rows.append(row(f"{label}: swing by MuJoCo, 1 ms", seconds, n, "us"))
+        ratio = float(np.median(seconds)) / n / medians[False]
+        section.ratios[f"rigid_body_engine_over_step_map: {label}"] = ratio
