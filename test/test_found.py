@@ -105,9 +105,10 @@ def test_mesh_and_walks_as_confirmed(name):
         assert math.log10(value) == pytest.approx(math.log10(mfpt), rel=0.01)
     # The mesh is a function of the step map to the last bit; another one that is as exact (2e-7)
     # moves single states over the threshold. In sliding mode, which is not smooth, all that only
-    # they lead to comes with them: three such maps gave 607478, 661912 and 658593 states, and MFPT
-    # that differ by 6 % at 1e22 steps and by 0.02 % at 55.
-    few = 0.1 if control.scheme == "smc" else 0.01
+    # they lead to comes with them: four such maps gave 607478, 661912, 658593 and 577423 states, a
+    # standard deviation of 6.6 %; two differ by three times that and the square root of two, at
+    # most. MFPT of the first three differ by 6 % at 1e22 steps, and by 0.02 % at 55.
+    few = 0.28 if control.scheme == "smc" else 0.01
     assert len(mesh.states) == pytest.approx(wanted["states"], rel=few)
     given = figures["walks"]
     for sigma_deg, mean in given["mean_steps"].items():
