@@ -254,6 +254,8 @@ def test_conditional_probabilities_in_high_precision():
 def test_a_coarse_set_gives_all_to_the_nearest_slope():
     p = conditional_probabilities([-0.1, 0.0, 0.1], 0.0, 0.05, 0.9999999)
     assert p == pytest.approx(np.eye(3), abs=1e-300)
+    p = conditional_probabilities([-0.1, 0.0, 0.1], 0.0, 5e-324, 0.9)
+    assert p.tolist() == np.eye(3).tolist()
 
 
 # Walks ------------------------------------------------------------------------------------------

@@ -143,7 +143,9 @@ def conditional_probabilities(
     slopes = _check_distribution(slopes, mu_s, sigma_s)
     correlation = check_correlation(correlation)
     means = mu_s + correlation * (slopes - mu_s)
-    return _normal(slopes, means[:, np.newaxis], spread_given_last(sigma_s, correlation))
+    # The smallest numbers become 0 when they are multiplied.
+    spread = max(spread_given_last(sigma_s, correlation), math.ulp(0.0))
+    return _normal(slopes, means[:, np.newaxis], spread)
 
 
 def _check_distribution(slopes: ArrayLike, mu_s: float, sigma_s: float) -> np.ndarray:

@@ -252,7 +252,9 @@ def ask_simulator(live: Live, random: Random) -> None:
 
 def ask_analysis(live: Live, random: Random) -> None:
     """A request to the analysis."""
-    asked = ComputeMfpt.Request(mesh_id=live.mesh_id, mu_s=0.0, sigma_s=[0.02, 0.05])
+    asked = ComputeMfpt.Request(
+        mesh_id=live.mesh_id, mu_s=0.0, sigma_s=[0.02, 0.05], correlation=0.5
+    )
     answer = live.compute(inputs.spoil(random, asked))
     judge(answer.success, answer.message)
 

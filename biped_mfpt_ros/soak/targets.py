@@ -238,7 +238,8 @@ def assemble_mesh() -> Iterator[Callable[[Random], None]]:
         # The reason to give up a mesh is told, and logged.
         check(len(assembly.missing) < 10_000)
         with contextlib.suppress(IncompleteMesh, ChainError):
-            result = metastability(assembly.mesh(), 0.0, inputs.number(random, 0.05))
+            correlation = inputs.number(random, random.choice((0.0, 0.5)))
+            result = metastability(assembly.mesh(), 0.0, inputs.number(random, 0.05), correlation)
             check(result.mfpt >= 1.0)
 
     yield give
@@ -399,15 +400,25 @@ _WALKER = (
     "--tolerance", "--json", "--quiet",
 )  # fmt: skip
 _MESH = ("--slope-step", "--slope-limit", "--threshold", "--max-states", "--unclustered")
+_GROUND = ("--mean", "--correlation")
 _COMMANDS = {
-    "run": (*_WALKER, *_MESH, "--mean", "--sigma", "--walks", "--seed", "--workers", "--namespace"),
-    "mfpt": (*_WALKER, *_MESH, "--mean", "--sigma"),
+    "run": (*_WALKER, *_MESH, *_GROUND, "--sigma", "--walks", "--seed", "--workers", "--namespace"),
+    "mfpt": (*_WALKER, *_MESH, *_GROUND, "--sigma"),
     "mesh": (*_WALKER, *_MESH, "--output"),
-    "monte-carlo": (*_WALKER, "--mean", "--sigma", "--walks", "--seed", "--max-steps"),
+    "monte-carlo": (*_WALKER, *_GROUND, "--sigma", "--walks", "--seed", "--max-steps"),
     "cycle": (*_WALKER, "--slope"),
     "step": (*_WALKER, "--slope", "--previous-slope", "--state"),
-    "picture": (*_WALKER, *_MESH, "--sigma", "--seed", "--number", "--last-steps", "--output"),
-    "inspect": ("--sigma", "--mean", "--json", "--quiet"),
+    "picture": (
+        *_WALKER,
+        *_MESH,
+        *_GROUND,
+        "--sigma",
+        "--seed",
+        "--number",
+        "--last-steps",
+        "--output",
+    ),
+    "inspect": (*_GROUND, "--sigma", "--json", "--quiet"),
     "node": (),
     "dance": _WALKER,
 }
@@ -465,6 +476,8 @@ def read_command_line(random: Random) -> None:
         sigmas = given["sigma"] if isinstance(given["sigma"], list) else [given["sigma"]]
         for sigma in sigmas:
             check(options.spread("--sigma", sigma) > 0.0)
+    if given.get("correlation") is not None:
+        check(abs(options.correlation_of(args)) < 1.0)
     if "threshold" in given:
         slopes = options.slopes_of(args)
         messages.MeshSettings(walking, model, slopes, args.threshold, **options.mesh_settings(args))
