@@ -36,9 +36,8 @@ _MOST_WAITING = 64  # requests
 _MOST_SIGMAS = 10_000  # in one request
 _PROGRESS_EVERY = 5.0  # s
 _SIGMAS_AT_ONCE = 64
-CORRELATION_LIMIT = 0.999
-"""Of the parameter: what ROS knows of ranges includes their ends, and 1 is out of range."""
 _PATIENCE = 10.0  # s, for messages of a mesh that was closed
+_MOST_CORRELATION = 0.999  # of the parameter: its range includes the ends, and 1 is not allowed
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,8 @@ class AnalysisParameters(NodeParameters):
     correlation: float = parameter(
         0.0,
         "correlation of each slope with the one before to publish MFPT for; 0: independent",
-        -CORRELATION_LIMIT,
-        CORRELATION_LIMIT,
+        -_MOST_CORRELATION,
+        _MOST_CORRELATION,
     )
     keep_meshes: int = parameter(4, "complete meshes kept for compute_mfpt", 1, 10_000)
     keep_states: int = parameter(
