@@ -147,6 +147,10 @@ class TestInProcess:
         result = run_json(capsys, *arguments, "--correlation", "-0.5")
         expected = monte_carlo(controller("hzd/cot"), math.radians(2.0), 50, 1, correlation=-0.5)
         assert result["correlation"] == -0.5
+        assert main([*arguments, "--mean", "1", "--correlation", "-0.5"]) == 0
+        assert "; slopes with mean 1 deg, correlation -0.5\n" in capsys.readouterr().out
+        assert main(arguments) == 0
+        assert "slopes with" not in capsys.readouterr().out
         assert result["mean_steps"] == expected.mean_steps
         assert result["paper"] is None
 

@@ -19,7 +19,7 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.files import whole_file
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.report.progress import duration_text
-from biped_mfpt_ros.report.tables import plural
+from biped_mfpt_ros.report.tables import ground_text, plural
 
 _MESH_ARRAYS = (
     "slopes", "states", "preceding", "generation", "targets", "outcomes", "scales",
@@ -77,7 +77,7 @@ def mfpt(args: argparse.Namespace) -> None:
     if args.json:
         print(json_text(result))
         return
-    print(_mesh_text(result))
+    print(_mesh_text(result) + ground_text(args.mean, correlation))
     print()
     print(mfpt_table(estimates))
 

@@ -33,7 +33,14 @@ from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.report import paper
 from biped_mfpt_ros.report.progress import MeshProgress, Progress, duration_text
-from biped_mfpt_ros.report.tables import correlation_text, difference, number, plural, table
+from biped_mfpt_ros.report.tables import (
+    correlation_text,
+    difference,
+    ground_text,
+    number,
+    plural,
+    table,
+)
 from biped_mfpt_ros.walker.robot import WalkerModel
 
 START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
@@ -442,7 +449,8 @@ def _report(result: dict[str, Any]) -> str:
     parts = [
         f"{result['controller']}: {plural(result['states'], 'state')} in "
         f"{plural(result['generations'], 'generation')}, "
-        f"{duration_text(result['seconds'])}",
+        f"{duration_text(result['seconds'])}"
+        f"{ground_text(math.degrees(result['mu_s']), result['correlation'])}",
         mfpt_table(result["estimates"]),
     ]
     if result["monte_carlo"]:

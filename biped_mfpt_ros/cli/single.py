@@ -24,7 +24,7 @@ from biped_mfpt_ros.gait.step import check_states, simulate_steps
 from biped_mfpt_ros.models import robot_from_file
 from biped_mfpt_ros.optimise.space import PARAMETRISATIONS
 from biped_mfpt_ros.report import paper
-from biped_mfpt_ros.report.tables import number, plural, table
+from biped_mfpt_ros.report.tables import ground_text, number, plural, table
 from biped_mfpt_ros.walker.outcome import Outcome
 
 
@@ -135,7 +135,7 @@ def monte_carlo(args: argparse.Namespace) -> None:
     )
     print(
         f"{plural(args.walks, 'walk')}, {result.counted.size} counted (more than one step), "
-        f"{plural(result.falls, 'fall')}"
+        f"{plural(result.falls, 'fall')}{ground_text(args.mean, correlation)}"
     )
     print(shares_table(result.failure_shares))
 

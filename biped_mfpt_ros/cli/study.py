@@ -13,7 +13,7 @@ from biped_mfpt_ros.control.controller import SCHEMES, Controller, catalogue_row
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.store import Store, Trial
 from biped_mfpt_ros.optimise.study import Study, best_trial
-from biped_mfpt_ros.report.tables import plural, table
+from biped_mfpt_ros.report.tables import ground_text, plural, table
 
 
 def study(args: argparse.Namespace) -> None:
@@ -168,7 +168,8 @@ def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
         assert t.found is not None
         stages[t.found.stage] = stages.get(t.found.stage, 0) + 1
     counts = ", ".join(f"{count} {stage}" for stage, count in sorted(stages.items()))
-    lines = [f"study {study.name}: {plural(len(done), 'trial')} ({counts})"]
+    ground = ground_text(np.degrees(study.settings.mu_s), study.settings.correlation)
+    lines = [f"study {study.name}: {plural(len(done), 'trial')} ({counts}){ground}"]
     if rows := run_rows(study, trials):
         left = study.runs_left()
         for row in rows:

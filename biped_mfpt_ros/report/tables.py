@@ -70,3 +70,10 @@ def difference(value: float, reference: float) -> str:
 def correlation_text(correlation: float) -> str:
     """What follows the standard deviation of slopes in a text; nothing for independent ones."""
     return f", correlation {correlation:g}" if correlation else ""
+
+
+def ground_text(mean_deg: float, correlation: float) -> str:
+    """What sets ground apart from the paper's; nothing for independent slopes of mean 0."""
+    if not (mean_deg or correlation):
+        return ""
+    return f"; slopes with mean {mean_deg:g} deg{correlation_text(correlation)}"
