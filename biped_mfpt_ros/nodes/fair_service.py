@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
+import traceback
 import uuid
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 
 from biped_mfpt_ros.nodes.qos import REQUESTS
 
@@ -97,8 +96,7 @@ class Waiting(Generic[T]):
 @dataclass(eq=False)
 class _Request:
     asked: Any
-    response: Any
-    answered: Future[Any] = field(default_factory=Future)
+    header: Any
 
 
 class FairService:
@@ -107,6 +105,9 @@ class FairService:
     A ROS 2 service has one queue for all clients, which loses the oldest request when it is full,
     and rclpy does not tell whose request is whose. So this empties that queue at once, and goes by
     the ``client`` that requests name. No request that is taken is left without an answer.
+
+    Answers are sent by the thread that computes them. Sent by the executor they would cost it two
+    more turns, in each of which it looks at all that the node has.
 
     Parameters
     ----------
@@ -136,42 +137,50 @@ class FairService:
         compute: Callable[[Any, Any], Any],
     ) -> None:
         self._node = node
+        self._kind = kind
         self._most = most
         self._thread = thread
         self._compute = compute
         self._lock = threading.Lock()
         self._waiting: Waiting[_Request] = Waiting(most)
         self._working = False
-        node.create_service(
-            kind, name, self._serve, qos_profile=REQUESTS, callback_group=ReentrantCallbackGroup()
-        )
+        service = node.create_service(kind, name, lambda asked, _: asked, qos_profile=REQUESTS)
+        self._send = service.send_response
+        # The executor calls it with what the callback returns, and the header, which answers need
+        # and no callback is told.
+        service.send_response = self._serve
 
-    async def _serve(self, asked: Any, response: Any) -> Any:
-        request = _Request(asked, response)
+    def _serve(self, asked: Any, header: Any) -> None:
         with self._lock:
-            refused = self._waiting.put(asked.client[:_MOST_OF_NAME], request)
+            refused = self._waiting.put(asked.client[:_MOST_OF_NAME], _Request(asked, header))
             if not self._working:
                 self._working = True
                 self._thread.submit(self._work)
         if refused is not None:
-            refused.response.busy = True
-            refused.response.message = (
+            message = (
                 f"busy: at most {self._most} requests wait, and no client has more than this one; "
                 "ask again later"
             )
-            refused.answered.set_result(refused.response)
-        return await request.answered
+            self._answer(refused, self._kind.Response(busy=True, message=message))
 
     def _work(self) -> None:
         """Answer the next request, and have what else the thread has to do done before another."""
         with self._lock:
             client, request = self._waiting.get()
         start = time.perf_counter()
-        request.answered.set_result(self._compute(request.asked, request.response))
-        if self._node.executor is not None:
-            self._node.executor.wake()
+        self._answer(request, self._compute(request.asked, self._kind.Response()))
         with self._lock:
             self._waiting.charge(client, time.perf_counter() - start)
             self._working = len(self._waiting) > 0
             if self._working:
                 self._thread.submit(self._work)
+
+    def _answer(self, request: _Request, response: Any) -> None:
+        try:
+            self._send(response, request.header)
+        except Exception:
+            # The client has gone, or the node ends.
+            if self._node.context.ok():
+                self._node.get_logger().error(
+                    f"a request could not be answered; going on\n{traceback.format_exc()}"
+                )
