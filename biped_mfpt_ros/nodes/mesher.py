@@ -86,10 +86,8 @@ class Mesher(Node):
             self._execute,
             goal_callback=self._on_goal,
             handle_accepted_callback=self._on_accepted,
-            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
         )
-        # One that is cancelled while it waits need not wait for its turn.
-        self._timer = self.create_timer(0.2, self._remove_cancelled)
         self.get_logger().info(f"ready, with step map {STEP_MAP}")
 
     def close(self) -> None:
@@ -114,6 +112,12 @@ class Mesher(Node):
         while self._waiting and self._growing < self.declared.now.meshes_at_once:
             self._growing += 1
             self._waiting.popleft().execute()
+
+    def _on_cancel(self, goal: ServerGoalHandle[Any, Any, Any]) -> CancelResponse:
+        # One that waits need not wait for its turn; but only after this does it count as cancelled.
+        if self.executor is not None:
+            self.executor.create_task(self._remove_cancelled)
+        return CancelResponse.ACCEPT
 
     def _remove_cancelled(self) -> None:
         for goal in [goal for goal in self._waiting if goal.is_cancel_requested]:
