@@ -195,6 +195,21 @@ def test_a_flood_to_a_simulator_delays_nobody_else(graph):
         assert response.success or f"at most {MOST_WAITING} requests wait" in response.message
 
 
+def test_an_answer_that_cannot_be_sent_keeps_no_other_back(graph):
+    class Odd(Simulator):
+        def _simulate(self, request, response):
+            return None if request.client == "odd" else super()._simulate(request, response)
+
+    graph.start(Odd)
+    tester = graph.start(Client)
+    (name,) = wait_for(tester.simulators, "the simulator")
+    client = tester.create_client(SimulateSteps, name, qos_profile=REQUESTS)
+    wait_for(client.service_is_ready, name)
+    odd = client.call_async(request(np.zeros((1, 10)), client="odd"))
+    assert result_of(client.call_async(request(np.zeros((1, 10)), client="tester"))).success
+    assert not odd.done()
+
+
 def test_a_mesh_goes_on_at_a_flooded_simulator(graph):
     # There is no other one.
     flooded = graph.start(HeldSimulator)
