@@ -1,4 +1,4 @@
-"""Answers of the step map on disk: a mesh keeps no successors in memory, and can be resumed.
+"""Answers of the step map on disk: a mesh keeps few successors in memory, and can be resumed.
 
 A file holds a header and a record for every answer, in the order in which answers came::
 
@@ -35,6 +35,7 @@ _CHECKSUM = struct.Struct("<I")
 _RECORD_MAGIC = 0x52534A42
 _RECORD = struct.Struct("<IIIII")
 _ROW_BYTES = 8 * STATE_SIZE
+_KEPT_BYTES = 32 << 20  # of answers in memory, which saves their way to a file without a name
 
 if sys.byteorder != "little":
     raise ImportError("journals are little-endian, as all machines are that this was tested on")
@@ -55,8 +56,8 @@ class Journal:
         All that determines the answers and the mesh, in any form.
     path : path-like, optional
         The file, made if missing. If it holds the journal of an equal mesh, its answers are there
-        from the beginning; otherwise it is begun anew. Without a path the file has no name, and is
-        gone with this object.
+        from the beginning; otherwise it is begun anew. Without a path the file has no name, is
+        gone with this object, and takes what goes beyond 32 MB, which stay in memory.
 
     Raises
     ------
@@ -72,6 +73,8 @@ class Journal:
         self._slopes = slopes
         self._path = None if path is None else Path(path)
         self._places: dict[int, tuple[int, int, int]] = {}
+        self._kept: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._room = _KEPT_BYTES if path is None else 0
         header = _HEADER.pack(_MAGIC, slopes, hashlib.sha256(identity).digest())
         header += _CHECKSUM.pack(zlib.crc32(header))
         if self._path is None:
@@ -98,21 +101,20 @@ class Journal:
         return self._places[start][1]
 
     def put(self, start: int, outcomes: np.ndarray, successors: np.ndarray) -> None:
-        """Append the answer for the states from ``start`` on: shapes (n, m) and (k, 10)."""
-        n, k = len(outcomes), len(successors)
+        """Keep the answer for the states from ``start`` on: shapes (n, m) and (k, 10)."""
         place = self._end + _RECORD.size
-        head = _RECORD.pack(_RECORD_MAGIC, start, n, k, 0)
-        # The bytes as they are, without a copy.
-        body = [
-            np.ascontiguousarray(a).reshape(-1).view(np.uint8).data for a in (outcomes, successors)
-        ]
-        if self._path is not None:  # else nobody will open it again
-            head = _RECORD.pack(_RECORD_MAGIC, start, n, k, _checksum(head, *body))
-        self._write(head, *body)
-        self._places[start] = place, n, k
+        size = outcomes.nbytes + successors.nbytes
+        if size <= self._room:
+            self._room -= size
+            self._kept[start] = outcomes, successors
+        else:
+            self._append(start, outcomes, successors)
+        self._places[start] = place, len(outcomes), len(successors)
 
     def get(self, start: int) -> tuple[np.ndarray, np.ndarray]:
         """The answer for the states from ``start`` on: outcomes (n, m), successors (k, 10)."""
+        if start in self._kept:
+            return self._kept[start]
         place, n, k = self._places[start]
         outcomes = np.empty((n, self._slopes), dtype=np.uint8)
         successors = np.empty((k, STATE_SIZE))
@@ -126,7 +128,19 @@ class Journal:
         """Close the file, and remove it if it is of no further use."""
         if remove and self._path is not None:
             self._path.unlink(missing_ok=True)
+        self._kept.clear()
         self._file.close()
+
+    def _append(self, start: int, outcomes: np.ndarray, successors: np.ndarray) -> None:
+        numbers = _RECORD_MAGIC, start, len(outcomes), len(successors)
+        head = _RECORD.pack(*numbers, 0)
+        # The bytes as they are, without a copy.
+        body = [
+            np.ascontiguousarray(a).reshape(-1).view(np.uint8).data for a in (outcomes, successors)
+        ]
+        if self._path is not None:  # else nobody will open it again
+            head = _RECORD.pack(*numbers, _checksum(head, *body))
+        self._write(head, *body)
 
     def _write(self, *parts: bytes | memoryview) -> None:
         left = [memoryview(part) for part in parts if len(part)]
