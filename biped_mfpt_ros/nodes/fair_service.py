@@ -17,7 +17,7 @@ from rclpy.node import Node
 from biped_mfpt_ros.nodes.qos import REQUESTS
 
 _MOST_OF_NAME = 256  # characters of a client's name that count
-_TURN = 0.05  # s, that a turn is worth: what a mesher asks for at once
+_TURN = 0.05  # s, that a turn is worth: half of what a mesher asks for at once
 _MOST_DEBT = 10.0  # s
 
 T = TypeVar("T")

@@ -178,7 +178,7 @@ class FanOutSettings:
         s, for how long to wait for a simulator when there is none that answers.
     """
 
-    chunk_seconds: float = 0.05
+    chunk_seconds: float = 0.1
     in_flight: int = 2
     timeout: float = 1.0
     wait_seconds: float = 10.0

@@ -35,7 +35,7 @@ class MesherParameters(NodeParameters):
     simulator_timeout: float = parameter(
         1.0, "s, after which a simulator that also takes 10 times too long is late", 0.01, 1e6
     )
-    chunk_seconds: float = parameter(0.05, "s, work in a full request", 1e-3, 10.0)
+    chunk_seconds: float = parameter(0.1, "s, work in a full request", 1e-3, 10.0)
     chunks_in_flight: int = parameter(2, "requests that each simulator has at once", 1, 100)
     progress_period: float = parameter(0.25, "s, between two progress messages", 0.05, 60.0)
     meshes_at_once: int = parameter(4, "meshes that grow at the same time", 1, 64)
