@@ -150,7 +150,7 @@ lower_builtin(operator.neg, _LanesType)(lambda context, builder, sig, args: buil
 
 
 @intrinsic
-def _select(context, mask, x, y):  # type: ignore[no-untyped-def]
+def _select(context, mask, x, y):
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         x, y = (_vector(context, builder, args[i], sig.args[i]) for i in (1, 2))
         return builder.select(args[0], x, y)
@@ -164,7 +164,7 @@ def select(condition: Any, x: Any, y: Any) -> Any:
 
 
 @overload(select)
-def _overload_select(condition, x, y):  # type: ignore[no-untyped-def]
+def _overload_select(condition, x, y):
     if isinstance(condition, _MaskType):
         return lambda condition, x, y: _select(condition, x, y)
     return lambda condition, x, y: x if condition else y
@@ -174,7 +174,7 @@ def _unary(name: str) -> Callable:
     """An intrinsic function of LLVM, of lanes."""
 
     @intrinsic
-    def function(context, x):  # type: ignore[no-untyped-def]
+    def function(context, x):
         def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
             kind = ir.FunctionType(_VECTOR, [_VECTOR])
             full_name = f"llvm.{name}.v{LANES}f64"
@@ -191,14 +191,14 @@ _magnitude, _square_root = _unary("fabs"), _unary("sqrt")
 
 
 @overload(abs)
-def _overload_abs(x):  # type: ignore[no-untyped-def]
+def _overload_abs(x):
     if isinstance(x, _LanesType):
         return lambda x: _magnitude(x)
     return None
 
 
 @overload(math.sqrt)
-def _overload_sqrt(x):  # type: ignore[no-untyped-def]
+def _overload_sqrt(x):
     if isinstance(x, _LanesType):
         return lambda x: _square_root(x)
     return None
@@ -214,7 +214,7 @@ def _pointer(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
 
 
 @intrinsic
-def load(context, array, row, i):  # type: ignore[no-untyped-def]
+def load(context, array, row, i):
     """Lanes ``array[row, i, :]`` of a contiguous array of shape (rows, k, LANES)."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -226,7 +226,7 @@ def load(context, array, row, i):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def store(context, array, row, i, value):  # type: ignore[no-untyped-def]
+def store(context, array, row, i, value):
     """Put lanes, or one number, into ``array[row, i, :]``."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -247,7 +247,7 @@ def _pointer_from(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
 
 
 @intrinsic
-def load_from(context, array, row, first):  # type: ignore[no-untyped-def]
+def load_from(context, array, row, first):
     """Lanes ``array[row, first : first + LANES]`` of a contiguous array of shape (rows, k)."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -259,7 +259,7 @@ def load_from(context, array, row, first):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def store_into(context, array, row, first, value):  # type: ignore[no-untyped-def]
+def store_into(context, array, row, first, value):
     """Put lanes, or one number, into ``array[row, first : first + LANES]``."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -271,7 +271,7 @@ def store_into(context, array, row, first, value):  # type: ignore[no-untyped-de
 
 
 @intrinsic
-def splat(context, number):  # type: ignore[no-untyped-def]
+def splat(context, number):
     """A number in every lane."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -281,7 +281,7 @@ def splat(context, number):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def lane_of(context, lanes, lane):  # type: ignore[no-untyped-def]
+def lane_of(context, lanes, lane):
     """The number in one lane."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -303,7 +303,7 @@ def _bits(builder: Any, value: Any) -> tuple[Any, Any, Callable[[int], Any]]:
 
 
 @intrinsic
-def mantissa(context, x):  # type: ignore[no-untyped-def]
+def mantissa(context, x):
     """``x 2^-binary_exponent(x)``, 0.5 to 1, of a positive number or lanes of them."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -317,7 +317,7 @@ def mantissa(context, x):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def binary_exponent(context, x):  # type: ignore[no-untyped-def]
+def binary_exponent(context, x):
     """Exponent of two of a positive number or lanes of them."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -333,7 +333,7 @@ def binary_exponent(context, x):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def power_of_two(context, x):  # type: ignore[no-untyped-def]
+def power_of_two(context, x):
     """``2^x`` for whole numbers or lanes of them, -1022 to 1023."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
@@ -346,7 +346,7 @@ def power_of_two(context, x):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def _negated_if_odd(context, x, number):  # type: ignore[no-untyped-def]
+def _negated_if_odd(context, x, number):
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         bits, _, constant = _bits(builder, args[0])
         last, _, _ = _bits(builder, args[1])
@@ -365,12 +365,12 @@ def negated_if_odd(x: Any, number: Any) -> Any:
 
 
 @overload(negated_if_odd)
-def _overload_negated_if_odd(x, number):  # type: ignore[no-untyped-def]
+def _overload_negated_if_odd(x, number):
     return lambda x, number: _negated_if_odd(x, number)
 
 
 @intrinsic
-def any_lane(context, mask):  # type: ignore[no-untyped-def]
+def any_lane(context, mask):
     """Whether a condition holds in any lane."""
 
     def generate(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
