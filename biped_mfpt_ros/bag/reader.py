@@ -174,7 +174,7 @@ class Bag:
         def fail(error: BagError) -> None:
             if on_error is None:
                 raise error
-            on_error(f"{Path(error.value).name} {error.problem}")
+            on_error(f"{Path(str(error.value)).name} {error.problem}")
 
         self.topics.clear()
         for file in self.files:

@@ -28,6 +28,7 @@ class Counting:
     """A number that counts the operations it takes part in."""
 
     count = 0
+    value: float
 
     def __init__(self, value: Any) -> None:
         self.value = float(value.value if isinstance(value, Counting) else value)

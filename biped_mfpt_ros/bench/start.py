@@ -34,7 +34,11 @@ def ready(repetitions: int) -> tuple[np.ndarray, np.ndarray]:
             start = time.perf_counter()
             process = nodes.start("simulator", f"simulator_{i}")
             name = f"{nodes.namespace}/simulator_{i}/simulate_steps"
-            nodes.spin(lambda name=name: name in nodes.simulators(), 300.0, "a simulator")
+
+            def there(name: str = name) -> bool:
+                return name in nodes.simulators()
+
+            nodes.spin(there, 300.0, "a simulator")
             out[i], cpu[i] = time.perf_counter() - start, cpu_seconds(process)
     return out, cpu
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
@@ -26,6 +26,7 @@ from biped_mfpt_ros.nodes.messages import MeshSettings, packed, settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
 from biped_mfpt_ros.nodes.spin import security_explained
 
+_Self = TypeVar("_Self", bound="Client")  # typing has Self from Python 3.11 on
 _POLL = 0.05  # s
 # What a recorder has to hear of a run: it finds each of them by itself, some tenths of a second
 # after its publisher, and a small mesh is grown and solved in less.
@@ -79,7 +80,7 @@ class Client:
         self._estimates: list[MfptEstimate] = []
         self._node.create_subscription(MfptEstimate, "mfpt", self._estimates.append, RESULTS)
 
-    def __enter__(self) -> Client:
+    def __enter__(self: _Self) -> _Self:
         """Start."""
         return self
 

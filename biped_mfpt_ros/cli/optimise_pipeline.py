@@ -31,7 +31,7 @@ class _StudyPipeline(Pipeline):
 
     def __init__(self, processes: Processes, progress: Progress, namespace: str) -> None:
         super().__init__(processes, progress, namespace)
-        self._commands: dict[str, tuple[str, dict[str, object]]] = {}
+        self._commands: dict[str, tuple[str, dict[str, Any]]] = {}
         self._restarts = 0
 
     def _node(self, name: str, executable: str, last: bool = False, **parameters: object) -> Child:

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -42,6 +42,10 @@ from biped_mfpt_ros.report.tables import (
     table,
 )
 from biped_mfpt_ros.walker.robot import WalkerModel
+
+if TYPE_CHECKING:  # ROS need not be there
+    from biped_mfpt_ros.cli.client import Client
+    from biped_mfpt_ros.nodes.messages import MeshSettings
 
 START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
 RESULT_TIMEOUT = 120.0  # s, for the analysis to solve the chain
@@ -209,7 +213,7 @@ class Pipeline:
         self.namespace = namespace
         self._simulators: set[str] = set()
         self._meshers = 0
-        self._mesher_parameters: dict[str, object] = {}
+        self._mesher_parameters: dict[str, Any] = {}
         self._survives = False
 
     def record(self, bag: Path, *, on_error: str = "stop") -> Child:
@@ -272,7 +276,11 @@ class Pipeline:
         return self._processes.start(name, command, environment=environment, last=last)
 
     def mesh(
-        self, settings: Any, mean: float, sigmas: dict[float, float], correlation: float = 0.0
+        self,
+        settings: MeshSettings,
+        mean: float,
+        sigmas: dict[float, float],
+        correlation: float = 0.0,
     ) -> dict[str, Any]:
         """Grow the mesh and get its MFPT for each sigma (rad to degrees)."""
         from biped_mfpt_ros.cli.client import Client
@@ -329,7 +337,7 @@ class Pipeline:
                 "curve": [{"sigma_s": e.sigma_s, "mfpt": e.mfpt} for e in curve],
             }
 
-    def up(self, client: Any) -> bool:
+    def up(self, client: Client) -> bool:
         """Whether all nodes are there."""
         peers = client.peers()
         missing = [what for what, there in asdict(peers).items() if not there]

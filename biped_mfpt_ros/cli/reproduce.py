@@ -15,7 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -41,6 +41,10 @@ from biped_mfpt_ros.study.store import Store
 from biped_mfpt_ros.study.tables import tables
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.terrain import slope_set
+
+if TYPE_CHECKING:  # ROS need not be there
+    from biped_mfpt_ros.cli.client import Client
+    from biped_mfpt_ros.nodes.recorder import Recorder
 
 _MOST_STATES = 200_000
 _RETRY = 0.05  # s
@@ -311,7 +315,7 @@ def _sigmas(job: Job) -> list[float]:
     return [options.spread("sigma", degrees) for degrees in job.settings["sigma_deg"]]
 
 
-def _grow(study: _Study, job: Job, client: Any) -> dict[str, Any]:
+def _grow(study: _Study, job: Job, client: Client) -> dict[str, Any]:
     """Grow a mesh."""
     from biped_mfpt_ros.nodes.messages import MeshSettings
 
@@ -352,7 +356,9 @@ def _published_deg(study: _Study) -> list[float]:
     return sorted({s for n in study.plan.controllers for s in SIGMA_DEG[scheme_of(n)]})
 
 
-def _wait_for_estimates(study: _Study, job: Job, client: Any, mesh_id: str, recorder: Any) -> None:
+def _wait_for_estimates(
+    study: _Study, job: Job, client: Client, mesh_id: str, recorder: Recorder
+) -> None:
     """Wait until a recorder has what the analysis publishes of a mesh."""
     sigmas = [options.spread("sigma", degrees) for degrees in _published_deg(study)]
     study.show(job, "waiting for the analysis")
@@ -370,7 +376,7 @@ def _wait_for_estimates(study: _Study, job: Job, client: Any, mesh_id: str, reco
     )
 
 
-def _solve(study: _Study, client: Any, grown: _Grown) -> None:
+def _solve(study: _Study, client: Client, grown: _Grown) -> None:
     """Take the MFPT of a mesh at all its sigmas, and keep the result."""
     from biped_mfpt_ros.cli.client import AnalysisFailed
 
@@ -398,7 +404,7 @@ def _solve(study: _Study, client: Any, grown: _Grown) -> None:
     study.finish(job, result, grown.seconds)
 
 
-def _estimate(study: _Study, job: Job, client: Any, mesh_id: str, sigma_s: float) -> Any:
+def _estimate(study: _Study, job: Job, client: Client, mesh_id: str, sigma_s: float) -> Any:
     """MFPT of a mesh at one sigma; None where the chain cannot be solved."""
     from biped_mfpt_ros.cli.client import AnalysisFailed
 

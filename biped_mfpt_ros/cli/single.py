@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import numpy as np
 
@@ -160,7 +161,7 @@ def controllers(args: argparse.Namespace) -> None:
         return
     papers = paper_controller_names()
     rows = [paper.figures(name) for name in papers]
-    others = [
+    others: list[dict[str, Any]] = [
         {"controller": n, "origin": origin(n), "confirmed": confirmed(n)}
         for n in catalogue()
         if n not in papers

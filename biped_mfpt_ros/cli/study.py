@@ -94,7 +94,7 @@ def described(controller: Controller) -> dict[str, Any]:
 
 
 def _list(store: Store, args: argparse.Namespace) -> None:
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name in store.names():
         opened = Study(store, name)
         trials = opened.trials()
@@ -181,26 +181,24 @@ def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
         if len(left) > 1:
             lines.append(f"{len(left)} runs share the trials until one is left: it takes more")
     confirmed = sorted(
-        (t for t in done if t.found is not None and t.found.confirmed),
-        key=lambda t: (-t.found.score, t.number),  # type: ignore[union-attr]
+        ((t.number, t.found) for t in done if t.found is not None and t.found.confirmed),
+        key=lambda trial: (-trial[1].score, trial[0]),
     )
     if not confirmed:
         return "\n".join([*lines, "nothing is confirmed yet"])
     sigma = np.degrees(study.settings.sigma_s)
-    rows = []
-    for t in confirmed[:top]:
-        assert t.found is not None
-        v = t.found.values
+    best = []
+    for trial, found in confirmed[:top]:
+        v = found.values
         check = ""
         if "check_steps" in v:
             check = (
                 f"{v['check_steps']:.4g} (mesh {v['check_claimed']:.4g}) "
                 f"at {np.degrees(v['check_sigma']):g} deg"
             )
-        rows.append((t.number, t.found.score, v.get("mfpt"), t.found.states, v["cot"], v["speed"],
-                     check))  # fmt: skip
+        best.append((trial, found.score, v.get("mfpt"), found.states, v["cot"], v["speed"], check))
     headers = ("trial", "score", f"MFPT at {sigma:g} deg", "states", "COT", "m/s", "Monte Carlo")
-    return "\n".join([*lines, "", "confirmed:", table(headers, rows)])
+    return "\n".join([*lines, "", "confirmed:", table(headers, best)])
 
 
 def run_rows(study: Study, trials: list[Trial]) -> list[dict[str, Any]]:

@@ -72,10 +72,8 @@ def warm_up() -> None:
     """Solve chains of one state, so that what solves them is compiled."""
     slopes, outcomes = np.array([0.0, 0.1]), np.array([[NOT_SIMULATED] * 2, [0, 1]])
     states = np.zeros((2, STATE_SIZE))
-    index = np.zeros(2, np.uint32)
-    mesh = Mesh(
-        slopes, states, index, index, [[0, 0], [1, 0]], outcomes, np.ones(STATE_SIZE), 1.0, True
-    )
+    index, targets = np.zeros(2, np.uint32), np.array([[0, 0], [1, 0]])
+    mesh = Mesh(slopes, states, index, index, targets, outcomes, np.ones(STATE_SIZE), 1.0, True)
     metastabilities(mesh, 0.0, [0.1])
 
 

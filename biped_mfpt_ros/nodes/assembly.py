@@ -103,6 +103,8 @@ class MeshAssembly:
         Why the mesh can never become complete; empty as long as it can.
     """
 
+    _early: list[tuple[Callable[[Any], None], Any]]
+
     def __init__(self, mesh_id: str) -> None:
         self.mesh_id = mesh_id
         self.settings: MeshSettings | None = None
@@ -216,7 +218,7 @@ class MeshAssembly:
         self._forget()
 
     def _forget(self) -> None:
-        self._early: list[tuple[Callable[[Any], None], Any]] = []
+        self._early = []
         zero = np.uint32(0)
         self._states = _Pieces("mesh/states", np.zeros(STATE_SIZE), zero, zero)
         self._rows = _Pieces("mesh/transitions")

@@ -170,7 +170,7 @@ class Meshes:
                     continue
                 self._growing.remove(growing)
                 self.fan_out.remove(growing.job)
-                if growing.job.growth.complete and not growing.ended:
+                if growing.growth.complete and not growing.ended:
                     self._beside.submit(growing.guarded, growing.finish)
         self._begin_new()
         for growing in self._growing:
@@ -189,6 +189,7 @@ class Meshes:
 class _Growing:
     """The mesh of a goal."""
 
+    growth: MeshGrowth
     job: Job
     _settings: MeshSettings
     _journal: Journal | None = None
@@ -255,7 +256,7 @@ class _Growing:
         settings = dataclasses.replace(settings, initial_state=initial)
         directory = self._meshes.parameters().checkpoint_directory
         self._journal = open_journal(settings, directory)
-        growth = MeshGrowth(
+        growth = self.growth = MeshGrowth(
             initial,
             settings.slopes,
             settings.threshold,
@@ -286,8 +287,8 @@ class _Growing:
         job = self.job
         if job.error is not None:
             raise job.error
-        while self._published < job.growth.generations:
-            first, states, preceding = job.growth.generation(self._published)
+        while self._published < self.growth.generations:
+            first, states, preceding = self.growth.generation(self._published)
             for message in states_messages(
                 self._mesh_id, self._published, first, states, preceding
             ):
@@ -298,7 +299,7 @@ class _Growing:
                 raise Cancelled
             if time.monotonic() - self._last_progress >= self._meshes.parameters().progress_period:
                 self._publish_progress()
-        return not job.growth.complete
+        return not self.growth.complete
 
     def cancel(self) -> None:
         """End the growth."""
@@ -306,7 +307,7 @@ class _Growing:
 
     def finish(self) -> None:
         """Compute the targets, publish them, and close the mesh."""
-        mesh = self.job.growth.mesh()
+        mesh = self.growth.mesh()
         for message in transitions_messages(self._mesh_id, mesh.targets, mesh.outcomes):
             self._meshes.transitions.publish(message)
         self._end(MeshInfo.COMPLETE, mesh=mesh)
@@ -323,7 +324,7 @@ class _Growing:
         if self._mesh_id:
             self._publish_progress()
             self._publish_info(status, message, mesh)
-            growth, tally = self.job.growth, self.job.tally
+            growth, tally = self.growth, self.job.tally
             result.mesh_id = self._mesh_id
             result.states = growth.known
             result.generations = growth.generations
@@ -358,10 +359,10 @@ class _Growing:
         message = MeshProgress(
             mesh_id=self._mesh_id,
             generation=max(0, self._published - 1),  # a mesh may fail before its first is out
-            states=job.growth.known,
+            states=self.growth.known,
             frontier=job.frontier,
             swings=job.tally.swings,
-            swings_resumed=job.growth.resumed,
+            swings_resumed=self.growth.resumed,
             simulators=fan_out.simulators,
             chunks_in_flight=fan_out.in_flight(job),
             chunks_repeated=job.tally.chunks_repeated,
@@ -379,8 +380,8 @@ class _Growing:
                 message=message,
                 settings=settings_message(self._settings),
                 step_map=STEP_MAP,
-                states=self.job.growth.known,
-                generations=self.job.growth.generations,
+                states=self.growth.known,
+                generations=self.growth.generations,
                 scales=packed(np.empty(0) if mesh is None else mesh.scales, "d"),
                 seconds=time.monotonic() - self._start,
             )

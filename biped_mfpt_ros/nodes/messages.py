@@ -49,7 +49,7 @@ def packed(values: np.ndarray, code: str) -> array[Any]:
     assigning the numpy array itself converts number by number.
     """
     out = array(code)
-    out.frombytes(np.ascontiguousarray(values, dtype=code).reshape(-1).view(np.uint8))
+    out.frombytes(np.ascontiguousarray(values, dtype=code).reshape(-1).view(np.uint8).data)
     return out
 
 
@@ -349,10 +349,13 @@ def steps_from(response: SimulateSteps.Response, n: int, m: int) -> Steps:
         if not np.isfinite(values).all():
             raise InputError(name, "not finite", "finite numbers")
         measures.append(values.reshape(-1, m))
+    durations, step_lengths, energies = measures
     return Steps(
         outcomes.reshape(n, m),
         following.reshape(steps, STATE_SIZE),
-        *measures,
+        durations,
+        step_lengths,
+        energies,
         seconds=response.seconds,
         integrator_steps=response.integrator_steps,
         evaluations=response.evaluations,

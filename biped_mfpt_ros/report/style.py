@@ -122,10 +122,10 @@ def with_palette(frames: Sequence[np.ndarray], colours: int) -> list[Image.Image
     where, first = np.unique(coarse(found), return_index=True)
     palette = found[first[np.searchsorted(where, common)]]
 
-    used = np.zeros(1 << 18, np.bool_)
+    is_used = np.zeros(1 << 18, np.bool_)
     for cell in cells:
-        used[cell] = True
-    (used,) = used.nonzero()
+        is_used[cell] = True
+    (used,) = is_used.nonzero()
     centres = np.stack([used >> 12, used >> 6 & 63, used & 63], axis=1) * 4 + 2
     index = np.zeros(1 << 18, np.uint8)
     index[used] = np.square(centres[:, None] - palette).sum(axis=2).argmin(axis=1)

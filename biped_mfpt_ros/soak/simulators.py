@@ -13,6 +13,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from subprocess import Popen
 
 import numpy as np
@@ -133,7 +134,7 @@ def _one_mesh(
         mesher = broken.meshers
         if mesher not in accepted and now - sent > _RESEND:
             sent = now
-            nodes.send(settings, results.append, lambda mesher=mesher: accepted.append(mesher))
+            nodes.send(settings, results.append, partial(accepted.append, mesher))
         broken.act()
         # Faults count while a mesh grows.
         if now >= next_fault and mesher in accepted:

@@ -189,21 +189,21 @@ class Published:
             )
             for status in (msg.MeshInfo.GROWING, msg.MeshInfo.COMPLETE)
         ]
-        states = []
+        states: list[Any] = []
         for generation in range(int(mesh.generation.max()) + 1):
             rows = np.flatnonzero(mesh.generation == generation)
             rows = rows[rows > 0]
             states += messages.states_messages(
                 mesh_id, generation, int(rows[0]), mesh.states[rows], mesh.preceding[rows]
             )
-        rows = [*messages.transitions_messages(mesh_id, mesh.targets, mesh.outcomes)]
+        transitions = [*messages.transitions_messages(mesh_id, mesh.targets, mesh.outcomes)]
         estimates = [
             messages.estimate_message(mesh_id, "hzd/base", mesh, 0.0, 0.05, 0.0, self.estimate, 0.1)
         ]
-        for topic in (infos, states, rows, estimates):
+        for topic in (infos, states, transitions, estimates):
             for sequence, message in enumerate(topic):
                 message.sequence = sequence
-        together = [infos[0], *states, infos[1], *rows, *estimates]
+        together = [infos[0], *states, infos[1], *transitions, *estimates]
         for _ in range(random.choice((0, 1, 1, 2))):
             inputs.spoil(random, random.choice(together))
         at = random.randrange(len(together))

@@ -272,7 +272,7 @@ class Judged:
             for i, refresh in enumerate(grid.values["scale_refresh"]):
                 chain = result["chain"][refresh]
                 if chain is not None:
-                    self.residuals[(*index, i)][1] = math.log(chain / theirs[1])
+                    self.residuals[index][i, 1] = math.log(chain / theirs[1])
             self.errors[index][..., 1] = scatter or 0.1
 
     @property

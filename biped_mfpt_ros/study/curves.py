@@ -55,7 +55,8 @@ def curves(results: Results) -> list[Curve]:
                     theirs.append((sigma, value, kind))
             walk = results.walks(n, sigma)
             if walk is not None and walk["low"] is not None:
-                walked.append((sigma, *(float(walk[k]) for k in ("mean_steps", "low", "high"))))
+                mean, low, high = (float(walk[k]) for k in ("mean_steps", "low", "high"))
+                walked.append((sigma, mean, low, high))
         solved = [
             (at, float(value))
             for at, value in zip(mesh["sigma_deg"], mesh["mfpt"], strict=True)

@@ -57,7 +57,9 @@ def readings() -> dict[str, Reading]:
     data = json.loads(files("biped_mfpt_ros").joinpath("data/readings.json").read_text())
     out = {}
     for name, row in data["controllers"].items():
-        settings = {k: math.inf if v == "none" else v for k, v in row["model"].items()}
+        settings: dict[str, Any] = {
+            k: math.inf if v == "none" else v for k, v in row["model"].items()
+        }
         unknown = [key for key in settings if key not in MODEL_FIELDS]
         if unknown:
             raise InputError(

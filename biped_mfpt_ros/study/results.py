@@ -66,10 +66,11 @@ class Results:
 
     def finest(self, name: str) -> dict[str, Any] | None:
         """The mesh that the figures are drawn of."""
-        job = (self.plan.of("mesh", name) or [None])[-1]
-        return None if job is None else self.mesh(
-            name, job.settings["slope_step_deg"], job.settings["threshold"]
-        )  # fmt: skip
+        jobs = self.plan.of("mesh", name)
+        if not jobs:
+            return None
+        settings = jobs[-1].settings
+        return self.mesh(name, settings["slope_step_deg"], settings["threshold"])
 
     def walks(self, name: str, sigma_deg: float) -> dict[str, Any] | None:
         """Monte Carlo at a standard deviation."""

@@ -164,7 +164,7 @@ def _settings_text(mesh: dict[str, Any] | None) -> str | None:
 
 def _mfpt(name: str, title: str, results: Results, names: Sequence[str]) -> Table:
     """Tables 2 and 4: the chain, coarse and fine, and Monte Carlo."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     sigma = TABLE_SIGMA_DEG[scheme_of(names[0])] if names else 0.0
     for n in names:
         theirs = {"chain": paper.mfpt(n, 0.0, sigma), "walks": paper.monte_carlo(n, 0.0, sigma)}
@@ -230,7 +230,8 @@ def _as_walks(
     """What a mesh predicts for walks, and how far Monte Carlo is from it."""
     value = mesh["counted"].get(sigma) if mesh else None
     counted = None if value is None else float(value)
-    return {"counted": counted, "bias": percent(counted, walked and float(walked["mean_steps"]))}
+    mean = None if walked is None else float(walked["mean_steps"])
+    return {"counted": counted, "bias": percent(counted, mean)}
 
 
 def _table5(results: Results) -> Table:

@@ -28,7 +28,7 @@ def verdicts(results: Results) -> Table:
             _judged(
                 f"{n}: Monte Carlo at {sigma:g}°",
                 paper.monte_carlo(n, 0.0, sigma),
-                walked and float(walked["mean_steps"]),
+                None if walked is None else float(walked["mean_steps"]),
                 "Monte Carlo",
                 _WALKS_WITHIN[scheme],
                 "the model's open settings (torque limit, friction, what counts as a slip)",

@@ -81,7 +81,7 @@ def counted(job: Job, state: list[float], bag: Path, mesh_id: str) -> dict[str, 
 
     mesh = read_meshes(bag)[mesh_id].mesh
     assert mesh is not None
-    means = []
+    means: list[float | None] = []
     for sigma_deg in job.settings["sigma_deg"]:
         try:
             means.append(mean_walk(mesh, math.radians(sigma_deg)))
