@@ -423,7 +423,11 @@ def test_limit_is_an_error_with_the_numbers_in_it():
     assert (error.max_states, error.threshold) == (50, 0.3)
     assert error.generation >= 2
     assert 1 <= error.explored < 49
-    for number in ("max_states = 50", f"generation {error.generation}", f"{error.explored} states"):
+    for number in (
+        "max_states = 50",
+        f"generation {error.generation}",
+        f"with {error.explored} simulated",
+    ):
         assert number in str(error)
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
