@@ -4,6 +4,7 @@ import json
 import math
 import os
 import signal
+import sqlite3
 import threading
 import time
 from dataclasses import replace
@@ -324,6 +325,16 @@ def test_two_owners_share_a_study_and_score_nothing_twice(scored, tmp_path):
     owners = {t.owner for t in Study(store, "test").trials() if t.found is not None}
     assert owners == {"elsewhere:1:0", "elsewhere:2:0"}
     store.close()
+
+
+def test_a_new_store_waits_for_another_that_writes_to_it(tmp_path):
+    other = sqlite3.connect(tmp_path / "s.sqlite", isolation_level=None, check_same_thread=False)
+    other.execute("BEGIN IMMEDIATE")  # what makes SQLite refuse a write-ahead log at once
+    release = threading.Timer(0.3, other.execute, ("ROLLBACK",))
+    release.start()
+    Store(tmp_path / "s.sqlite").close()
+    release.join()
+    other.close()
 
 
 @pytest.mark.parametrize("owner", ["elsewhere:1:0", None])

@@ -25,6 +25,7 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.scoring import Evaluation
 from biped_mfpt_ros.optimise.settings import StudySettings
 
+_WAIT_SECONDS = 60.0  # for others that write, before it is an error
 STALE_SECONDS = 30.0
 """s without a sign of life, after which an owner loses its claims."""
 
@@ -122,11 +123,11 @@ class Store:
         self._lock = threading.RLock()
         # Waits for other processes rather than fail; autocommit but for explicit transactions.
         self._database = sqlite3.connect(
-            path, timeout=60.0, isolation_level=None, check_same_thread=False
+            path, timeout=_WAIT_SECONDS, isolation_level=None, check_same_thread=False
         )
         try:
+            self._use_wal()
             # A commit that is lost with the power costs a trial, and a sync costs milliseconds.
-            self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
             (version,) = self._database.execute("PRAGMA user_version").fetchone()
             if version not in (0, _VERSION):
@@ -137,6 +138,21 @@ class Store:
                 self._database.execute(f"PRAGMA user_version = {_VERSION}")
         except sqlite3.DatabaseError as error:
             raise InputError("store", str(path), f"an SQLite file of studies ({error})") from None
+
+    def _use_wal(self) -> None:
+        """Keep a write-ahead log, which readers need not wait for.
+
+        While another one writes to a new file SQLite refuses at once, however long it may wait.
+        """
+        until = time.monotonic() + _WAIT_SECONDS
+        while True:
+            try:
+                self._database.execute("PRAGMA journal_mode = WAL")
+                return
+            except sqlite3.OperationalError as error:
+                if "locked" not in str(error) or time.monotonic() > until:
+                    raise
+            time.sleep(0.01)
 
     def close(self) -> None:
         """Close the file."""
