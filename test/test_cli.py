@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ros_graph import DOMAIN, PATIENCE, ros_graph
-from test_resume import Counting
+from test_resume import Gate, Gated
 
 from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.cli.output import json_text
@@ -752,8 +752,9 @@ class TestRun:
             # In the place of its own simulator, and held before the mesh is complete.
             wait_until(lambda: "simulator" in run.nodes(), run, "its simulator")
             os.kill(run.nodes()["simulator"][0], signal.SIGSTOP)
-            simulator = graph.start(lambda: Counting("killed_simulator", namespace="/killed"))
-            simulator.hold_after(50)
+            gate = Gate()
+            gate.hold_after(50)
+            graph.start(lambda: Gated(gate, "killed_simulator", namespace="/killed"))
             kept = run_checkpoint(run)
             wait_until(
                 lambda: any(path.stat().st_size > 20_000 for path in kept.glob("*.journal")),
@@ -761,7 +762,7 @@ class TestRun:
                 "the mesh to grow",
             )
             os.kill(run.nodes()["mesher"][0], signal.SIGKILL)
-            simulator.release()
+            gate.release()
             code, out, err = run.end()
         assert code == 0, err
         assert "starting another one, which goes on where it was" in err

@@ -3,7 +3,8 @@
 import math
 import signal
 import threading
-import time
+from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,39 +21,62 @@ from biped_mfpt_ros.cli import client as cli
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.nodes.mesher import Mesher
+from biped_mfpt_ros.nodes.messages import unpacked
 from biped_mfpt_ros.nodes.simulator import Simulator
 
 MFPT = controller("hzd/mfpt")
 IN_FLIGHT = 2
 
 
-class Counting(Simulator):
-    """Counts the states that it simulates, and takes its time for it; may be held."""
+class Gate:
+    """Knows who asked for which states, and holds all simulators after so many of them."""
 
-    count = largest = 0
-    hold_above = math.inf
+    def __init__(self):
+        self.asked = defaultdict(set)
+        self.largest = 0
+        self._hold_above = math.inf
+        self._go_on = threading.Event()
+        self._lock = threading.Lock()
 
-    def __init__(self, name=None, **options):
-        super().__init__(name, **options)
-        self.go_on = threading.Event()
-
-    def _simulate(self, request, response):
-        if self.count > self.hold_above:
-            self.go_on.wait(PATIENCE)
-        self.count += len(request.previous_slopes)
-        self.largest = max(self.largest, len(request.previous_slopes))
-        time.sleep(0.1)  # so that a mesh outlasts what is slow to cancel it
-        return super()._simulate(request, response)
+    @property
+    def count(self):
+        """States simulated; those that one client asked for again count once."""
+        return sum(map(len, list(self.asked.values())))
 
     def hold_after(self, more):
-        """Simulate that many more states, and no further request until released."""
-        self.go_on.clear()
-        self.hold_above = self.count + more
+        """Let that many more states be simulated, and no further request until released."""
+        self._go_on.clear()
+        self._hold_above = self.count + more
 
     def release(self):
         """Go on with what was held."""
-        self.hold_above = math.inf
-        self.go_on.set()
+        self._hold_above = math.inf
+        self._go_on.set()
+
+    def enter(self, request):
+        """Wait if it is held."""
+        with self._lock:
+            held = self.count > self._hold_above
+        if held:
+            self._go_on.wait(PATIENCE)
+        states = np.column_stack(
+            [unpacked(request.states, "d").reshape(-1, 10), unpacked(request.previous_slopes, "d")]
+        )
+        with self._lock:
+            self.asked[request.client].update(row.tobytes() for row in states)
+            self.largest = max(self.largest, len(states))
+
+
+class Gated(Simulator):
+    """Simulates what a gate lets through."""
+
+    def __init__(self, gate, name=None, **options):
+        self._gate = gate
+        super().__init__(name, **options)
+
+    def _simulate(self, request, response):
+        self._gate.enter(request)
+        return super()._simulate(request, response)
 
 
 @pytest.fixture
@@ -80,7 +104,9 @@ def mesh_here(goal):
 def launch(graph, name, directory):
     return graph.launch(
         "mesher", "--ros-args", "-r", f"__node:={name}", "-p", f"checkpoint_directory:={directory}",
-        "-p", "chunk_seconds:=0.001", "-p", "simulator_wait_seconds:=60.0",
+        "-p", "chunk_seconds:=0.001", "-p", f"simulator_wait_seconds:={PATIENCE}",
+        # None is late, not even one that is held: what it has is not handed on.
+        "-p", "simulator_timeout:=60.0",
     )  # fmt: skip
 
 
@@ -116,22 +142,21 @@ def journals(directory):
 def test_mesher_killed_again_and_again_ends_with_the_same_mesh(
     graph, tester, goal, mesh_here, tmp_path, sent, kills
 ):
-    simulators = [graph.start(lambda name=name: Counting(name)) for name in ("one", "two")]
+    gate = Gate()
+    simulators = [graph.start(lambda name=name: Gated(gate, name)) for name in ("one", "two")]
     n = len(mesh_here.states) - 1
     rng = np.random.default_rng(1)
     for kill in range(kills):
         mesher = launch(graph, f"mesher_{kill}", tmp_path)
-        answered = sum(s.count for s in simulators)
         more = int(rng.integers(n // 8, n // 6))
+        enough = gate.count + more
         # However slow the mesher is to die, its mesh is not complete by then.
-        for simulator in simulators:
-            simulator.hold_after(more // 2)
+        gate.hold_after(more)
         assert tester.send_goal_to(f"mesher_{kill}", goal).accepted
-        wait_for(lambda more=more, a=answered: sum(s.count for s in simulators) > a + more, "work")
+        wait_for(lambda enough=enough: gate.count > enough, "work")
         mesher.send_signal(sent)
         mesher.wait(PATIENCE)
-        for simulator in simulators:
-            simulator.release()
+        gate.release()
         assert len(journals(tmp_path)) == 1, kill
     launch(graph, "mesher", tmp_path)
     handle = tester.send_goal_to("mesher", goal)
@@ -140,9 +165,8 @@ def test_mesher_killed_again_and_again_ends_with_the_same_mesh(
     assert_same_mesh(tester.mesh(result.mesh_id), mesh_here)
     assert result.swings + result.swings_resumed == n
     # At most the chunks in flight were simulated again, for each kill: all else was resumed.
-    in_flight = kills * IN_FLIGHT * sum(s.largest for s in simulators)
-    simulated = sum(s.count for s in simulators)
-    assert n <= simulated <= n + in_flight
+    in_flight = kills * IN_FLIGHT * len(simulators) * gate.largest
+    assert n <= gate.count <= n + in_flight
     assert result.swings_resumed > max(0, kills * (n // 8) - in_flight)
     assert journals(tmp_path) == []
 
@@ -150,7 +174,10 @@ def test_mesher_killed_again_and_again_ends_with_the_same_mesh(
 def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_cancelled_one(
     graph, tester, goal, mesh_here, tmp_path
 ):
-    simulator = graph.start(Counting)
+    # Nobody completes it before it is told to end.
+    endless = replace(goal, threshold=1e-6, max_states=10**8)
+    gate, again = Gate(), Gate()
+    simulator = graph.start(lambda: Gated(gate))
     mesher = graph.start(
         Mesher, checkpoint_directory=str(tmp_path), simulator_wait_seconds=1e6,
         simulator_timeout=0.1, chunk_seconds=0.001,
@@ -160,8 +187,8 @@ def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_
         (result,) = mesher.set_parameters([Parameter("simulator_wait_seconds", value=value)])
         assert result.successful
 
-    handle = tester.send_goal(goal)
-    wait_for(lambda: simulator.count > 100, "work")
+    handle = tester.send_goal(endless)
+    wait_for(lambda: gate.count > 100, "work")
     graph.stop(simulator)
     wait_seconds(0.3)
     status, result = tester.outcome(handle)
@@ -169,8 +196,8 @@ def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_
     assert "no simulator answered" in result.message
     assert len(journals(tmp_path)) == 1
     wait_seconds(1e6)
-    again = graph.start(lambda: Counting("again"))
-    handle = tester.send_goal(goal)
+    graph.start(lambda: Gated(again, "again"))
+    handle = tester.send_goal(endless)
     wait_for(lambda: again.count > 20, "work")
     assert len(journals(tmp_path)) == 1
     handle.cancel_goal_async()
