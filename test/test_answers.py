@@ -2,6 +2,7 @@
 
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from rclpy.action import ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
-from ros_graph import DOMAIN, result_of, ros_graph, wait_for
+from ros_graph import DOMAIN, PATIENCE, result_of, ros_graph, wait_for
 
 from biped_mfpt_ros.cli.optimise_pipeline import StudyClient
 from biped_mfpt_ros.control.controller import controller
@@ -37,15 +38,24 @@ def graph():
 
 
 @pytest.fixture
-def impatient(monkeypatch):
-    monkeypatch.setattr(answers, "AGAIN", 0.2)
+def later(monkeypatch):
+    """Call it to have whoever waits for an answer ask again, whatever time has passed."""
+    jumps = []
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + sum(jumps))
+    monkeypatch.setattr(answers, "time", clock)
+    monkeypatch.setattr(answers, "AGAIN", PATIENCE)
+    return lambda: jumps.append(1e3 * PATIENCE)
 
 
 class Forgetful(Node):
-    """Loses some of what it is asked first: goals, requests for results, and questions."""
+    """Loses some of what it is asked first: goals, requests for results, and questions.
 
-    def __init__(self, kind, name, result, lost):
+    Calls ``on_loss`` whenever it has.
+    """
+
+    def __init__(self, kind, name, result, lost, on_loss=lambda: None):
         super().__init__("forgetful")
+        self._on_loss = on_loss
         self.executed = 0
         self.questions = []
 
@@ -71,6 +81,7 @@ class Forgetful(Node):
         async def forget(request):
             if left[0]:
                 left[0] -= 1
+                self._on_loss()
             else:
                 await serve(request)
 
@@ -80,6 +91,7 @@ class Forgetful(Node):
         self.questions.append(len(request.sigma_s))
         if self._lost_questions:
             self._lost_questions -= 1
+            self._on_loss()
             await Future()
         if request.sigma_s:
             response.success = True
@@ -112,12 +124,12 @@ def test_a_goal_that_is_answered_at_once_is_answered_in_any_thread(graph):
         return data
 
     client.take_data = take_data
-    handle = result_of(client.send_goal_async(GrowMesh.Goal(), lambda feedback: None), 10.0)
+    handle = result_of(client.send_goal_async(GrowMesh.Goal(), lambda feedback: None))
     assert handle.accepted
     client.destroy()
 
 
-def test_an_answer_is_asked_for_again_and_the_first_one_counts(impatient):
+def test_an_answer_is_asked_for_again_and_the_first_one_counts(later):
     futures = []
     left = []
 
@@ -126,9 +138,10 @@ def test_an_answer_is_asked_for_again_and_the_first_one_counts(impatient):
         return futures[-1]
 
     answer = Answer(ask, left.append)
-    assert len(futures) == 1
-    wait_for(lambda: answer.done() or len(futures) == 3, "three questions")
-    assert not answer.done()
+    for asked in (1, 2, 3):
+        assert not answer.done()
+        assert len(futures) == asked
+        later()
     futures[1].set_result("second")
     assert answer.come.is_set()
     assert answer.done()
@@ -138,7 +151,7 @@ def test_an_answer_is_asked_for_again_and_the_first_one_counts(impatient):
     assert len(futures) == 3
 
 
-def test_a_goal_that_was_accepted_twice_is_cancelled_once(impatient):
+def test_a_goal_that_was_accepted_twice_is_cancelled_once(later):
     class Handle:
         accepted = True
         cancelled = False
@@ -154,7 +167,9 @@ def test_a_goal_that_was_accepted_twice_is_cancelled_once(impatient):
         return sent[-1]
 
     answer = accepted(send)
-    wait_for(lambda: answer.done() or len(sent) == 2, "the second goal")
+    later()
+    assert not answer.done()
+    assert len(sent) == 2
     for future, handle in zip(futures, handles, strict=True):
         future.set_result(handle)
     assert answer.result() is handles[0]
@@ -165,7 +180,7 @@ class Deadline:
     """Ends a wait that would never end."""
 
     def __init__(self):
-        self._over = time.monotonic() + 60.0
+        self._over = time.monotonic() + PATIENCE
 
     def __call__(self):
         assert time.monotonic() < self._over
@@ -180,29 +195,29 @@ def run_client():
     client.leave()
 
 
-def test_a_run_survives_lost_answers(graph, run_client, impatient):
+def test_a_run_survives_lost_answers(graph, run_client, later):
     result = GrowMesh.Result(success=True, mesh_id="grown")
-    node = graph.start(lambda: Forgetful(GrowMesh, "grow_mesh", result, 2))
+    node = graph.start(lambda: Forgetful(GrowMesh, "grow_mesh", result, 2, later))
     wait_for(run_client._grow.server_is_ready, "the mesher")
     settings = MeshSettings(BASE, WalkerModel(), slope_set(1.0), 1.0)
     assert run_client.grow_mesh(settings, lambda progress: None).mesh_id == "grown"
     assert node.executed == 1
 
 
-def test_a_study_survives_lost_answers(graph, run_client, impatient):
+def test_a_study_survives_lost_answers(graph, run_client, later):
     result = Optimise.Result(success=True, message="trials")
-    node = graph.start(lambda: Forgetful(Optimise, "optimise", result, 2))
+    node = graph.start(lambda: Forgetful(Optimise, "optimise", result, 2, later))
     wait_for(run_client.optimiser_is_there, "the optimiser")
     goal = goal_message("study", StudySettings(BASE))
     assert run_client.optimise(goal, lambda trial: None) == "trials"
     assert node.executed == 1
 
 
-def test_the_optimiser_survives_lost_answers(graph, impatient):
+def test_the_optimiser_survives_lost_answers(graph, later):
     result = GrowMesh.Result(success=True, mesh_id="grown")
-    node = graph.start(lambda: Forgetful(GrowMesh, "grow_mesh", result, 2))
+    node = graph.start(lambda: Forgetful(GrowMesh, "grow_mesh", result, 2, later))
     asking = graph.start(lambda: Node("asking"))
-    backend = PipelineBackend(asking, lambda: 60.0)
+    backend = PipelineBackend(asking, lambda: PATIENCE)
     settings = StudySettings(BASE)
     cycle = find_limit_cycle(BASE)
     stage = Stage(1.0, 1.0)
