@@ -20,8 +20,11 @@ import os, signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # it may have been ignored, and inherited
 from biped_mfpt_ros.cli.workers import workers
 with workers(2) as pool:
-    print(*{f.result() for f in [pool.submit(os.getpid)] * 2}, flush=True)
-    pool.submit(time.sleep, 3600).result()
+    pids = {f.result() for f in [pool.submit(os.getpid)] * 2}
+    job = pool.submit(time.sleep, 3600)
+    # Not before: where Python runs a callback, it drops a KeyboardInterrupt.
+    print(*pids, flush=True)
+    job.result()
 """
 
 
@@ -67,8 +70,6 @@ def test_workers_end_with_their_parent(how):
     pids = [int(pid) for pid in parent.stdout.readline().split()]
     assert pids
     assert all(map(alive, pids))
-    # Until it waits for the job: where Python runs a callback, it drops a KeyboardInterrupt.
-    time.sleep(0.5)
     parent.send_signal(how)
     parent.wait(PATIENCE)  # its job takes longer
     wait_until_gone(pids)
