@@ -1,7 +1,6 @@
 """The nodes in one process: what they serve and publish, and what they do with bad input."""
 
 import math
-import threading
 import time
 from dataclasses import dataclass
 
@@ -356,11 +355,6 @@ def refuse(request, response):
     return response
 
 
-def never(request, response):
-    threading.Event().wait(0.3)
-    return response
-
-
 def fake_simulator(answer):
     """Node that serves `SimulateSteps` in its own way."""
 
@@ -395,11 +389,14 @@ def other_step_map(request, response):
 )
 def test_mesh_beside_a_bad_simulator(graph, tester, mesh_here, answer, said):
     graph.start(fake_simulator(answer))
-    mesher = graph.start(Mesher, simulator_wait_seconds=0.5)
-    wait_for(lambda: mesher.simulators.found(), "the mesher to find the fake simulator")
-    status, result = tester.grow(settings())
+    mesher = graph.start(Mesher, simulator_wait_seconds=PATIENCE)
+    handle = tester.send_goal(settings())
+    wait_for(lambda: mesher.simulators.dropped, "the mesher to drop the fake simulator")
+    mesher.set_parameters([Parameter("simulator_wait_seconds", value=0.0)])
+    status, result = tester.outcome(handle)
     assert status == GoalStatus.STATUS_ABORTED
     assert said in result.message
+    mesher.set_parameters([Parameter("simulator_wait_seconds", value=PATIENCE)])
     graph.start(Simulator)
     wait_for(lambda: mesher.simulators.found(), "the mesher to find the good simulator")
     status, result = tester.grow(settings())
@@ -619,19 +616,22 @@ def test_mesh_is_taken_in_whichever_order_its_messages_come(graph, tester, mesh_
 def compute(mesh_here):
     with ros_graph() as graph, pytest.MonkeyPatch.context() as patch:
         tester = graph.start(Client)
-        graph.start(Analysis)
+        analysis = graph.start(Analysis)
         publisher = graph.start(Publisher)
         publisher.publish(mesh_here, "good")
         compute = tester.service(ComputeMfpt, "compute_mfpt")
         wait_for(lambda: compute(ask("good")).success, "the mesh")
-        patch.setattr("biped_mfpt_ros.nodes.analysis._PATIENCE", 0.1)
+        patch.setattr("biped_mfpt_ros.nodes.analysis._PATIENCE", PATIENCE)
         publisher.publish(mesh_here, "gap", lost=[(1, 1)])
         publisher.publish(mesh_here, "failed", status=MeshInfo.FAILED)
         publisher.publish(mesh_here, "open", lost=[(0, 1)])
         publisher.publish(mesh_here, "unended", lost=[(2, 0)])
-        # The topics arrive in any order.
-        wait_for(lambda: "messages were lost" in compute(ask("gap")).message, "the gap")
-        wait_for(lambda: "messages were lost" in compute(ask("unended")).message, "the end")
+        # The topics arrive in any order; what has not come when all the rest has was lost.
+        n = len(mesh_here.states)
+        for mesh_id, said in (("gap", "index 2 to before"), ("unended", f"{n} states {n} have")):
+            wait_for(lambda m=mesh_id, s=said: s in compute(ask(m)).message, mesh_id)
+            analysis._due[mesh_id] = 0.0
+            wait_for(lambda m=mesh_id: "messages were lost" in compute(ask(m)).message, mesh_id)
         yield compute
 
 
