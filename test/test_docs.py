@@ -59,7 +59,7 @@ def test_python_runs_without_ros(page, index, tmp_path):
         (tmp_path / "robot.json").write_text(text)
     code = WITHOUT_ROS + blocks(ROOT / page, "python")[index]
     ended = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=600
     )
     assert ended.returncode == 0, ended.stderr
     assert float(ended.stdout.split()[0]) > 0.0

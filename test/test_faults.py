@@ -90,7 +90,7 @@ def test_a_signal_in_any_phase_ends_everything_within_5_s(tmp_path, phase, numbe
 def test_what_killed_processes_leave_in_shared_memory_is_removed(tmp_path):
     with ros_graph() as graph:
         process = graph.launch("recorder", "--ros-args", "-p", f"bag:={tmp_path / 'bag'}")
-        wait_for((tmp_path / "bag" / "bag_0.mcap").exists, "the recorder", 120.0)
+        wait_for((tmp_path / "bag" / "bag_0.mcap").exists, "the recorder")
         maps = Path("/proc", str(process.pid), "maps").read_text().split()
         mapped = {Path(word) for word in maps if re.fullmatch(r"/dev/shm/fastdds_[0-9a-f]+", word)}
         assert mapped

@@ -272,7 +272,9 @@ def test_a_mesh_goes_on_beside_a_flooded_simulator(graph):
     # The mesher hands the work of a simulator that others keep busy on to those that answer.
     flooded = graph.start(lambda: Simulator("simulator_flooded"))
     graph.start(lambda: Simulator("simulator_free"))
-    mesher = graph.start(Mesher, simulator_timeout=0.1, chunk_seconds=0.001)
+    mesher = graph.start(
+        Mesher, simulator_timeout=0.1, chunk_seconds=0.001, simulator_wait_seconds=PATIENCE
+    )
     flooder, tester = graph.start(Flooder), graph.start(Client)
     wait_for(lambda: len(mesher.simulators.found()) == 2, "both simulators")
     name = f"/{flooded.get_name()}/simulate_steps"

@@ -70,7 +70,7 @@ def test_mesh_is_the_same_although_the_link_between_two_hosts_is_cut(tmp_path):
             start(
                 A, REMOTE.format("mesher"), "--ros-args", "-p", "chunk_seconds:=0.001",
                 "-p", "simulator_timeout:=0.3", "-p", "progress_period:=0.05",
-                **network,
+                "-p", "simulator_wait_seconds:=600.0", **network,
             ),
         ]  # fmt: skip
         try:

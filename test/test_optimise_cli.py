@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from ros_graph import PATIENCE
 
 from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.optimise.store import Store
@@ -189,7 +190,7 @@ def test_a_study_that_was_killed_goes_on(tmp_path, number):
     command = [sys.executable, "-m", "biped_mfpt_ros.cli", "optimise", *QUICK,
                "--store", str(path), "--study", "s"]  # fmt: skip
     process = subprocess.Popen(command, env=dict(os.environ))
-    deadline = time.monotonic() + 300.0
+    deadline = time.monotonic() + PATIENCE
     while not path.exists() or len(outline_so_far(path)) < 8:
         assert time.monotonic() < deadline
         assert process.poll() is None

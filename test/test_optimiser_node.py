@@ -10,7 +10,7 @@ from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.action import Optimise
 from biped_mfpt_msgs.msg import OptimisationTrial
 from rclpy.node import Node
-from ros_graph import result_of, ros_graph, wait_for
+from ros_graph import PATIENCE, result_of, ros_graph, wait_for
 
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.nodes.analysis import Analysis
@@ -316,10 +316,13 @@ def test_a_node_that_is_replaced_costs_nothing(graph, client, store_path, tmp_pa
 def test_a_node_that_dies_costs_no_study(graph, victim, tmp_path):
     """One of the processes is killed and started again; the trials are as if it had not been."""
     path, namespace = tmp_path / "studies.sqlite", f"without_{victim}"
-    store = ("-p", f"store:={path}", "-p", "patience:=10.0")
+    parameters = {
+        "mesher": ("-p", f"simulator_wait_seconds:={PATIENCE}"),
+        "optimiser": ("-p", f"store:={path}", "-p", f"patience:={PATIENCE}"),
+    }
 
     def launch(name):
-        more = store if name == "optimiser" else ()
+        more = parameters.get(name, ())
         return graph.launch(name, "--ros-args", "-r", f"__ns:=/{namespace}", *more)
 
     processes = {n: launch(n) for n in ("simulator", "mesher", "analysis", "optimiser")}

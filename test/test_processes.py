@@ -74,7 +74,7 @@ def simulators(graph, client, count):
 
 # Small chunks, so that small meshes keep several simulators busy.
 MESHER = ("--ros-args", "-p", "chunk_seconds:=0.001", "-p", "simulator_timeout:=0.3",
-          "-p", "progress_period:=0.05", "-p", "simulator_wait_seconds:=30.0")  # fmt: skip
+          "-p", "progress_period:=0.05", "-p", f"simulator_wait_seconds:={PATIENCE}")  # fmt: skip
 
 
 def test_pipeline_of_processes(graph, client):
