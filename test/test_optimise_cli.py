@@ -1,6 +1,7 @@
 """`biped-mfpt optimise` and `biped-mfpt study`."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -12,6 +13,8 @@ import pytest
 from ros_graph import PATIENCE
 
 from biped_mfpt_ros.cli import main
+from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.optimise.settings import StudySettings
 from biped_mfpt_ros.optimise.store import Store
 from biped_mfpt_ros.optimise.study import Study
 
@@ -75,6 +78,21 @@ def test_list_and_show(finished, capsys):
     assert [t["score"] for t in shown["trials"][:20]] == [t[3] for t in outline(finished)]
     assert main(["study", "show", "s", "--store", str(finished)]) == 0
     assert "parameters of trial" in capsys.readouterr().out
+
+
+def test_the_list_tells_the_ground(tmp_path, capsys):
+    path = tmp_path / "s.sqlite"
+    settings = StudySettings(
+        controller("hzd/mfpt"), mu_s=math.radians(-1.5), sigma_s=math.radians(2.5), correlation=0.75
+    )
+    Store(path).create("rolling", settings)
+    (row,) = result_of(capsys, "study", "list", "--store", str(path))["studies"]
+    assert {key: row[key] for key in ("mu_s", "sigma_s", "correlation")} == {
+        "mu_s": settings.mu_s, "sigma_s": settings.sigma_s, "correlation": 0.75
+    }  # fmt: skip
+    assert main(["study", "list", "--store", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert all(text in shown for text in ("-1.5 deg", "2.5 deg", "0.75"))
 
 
 def test_what_is_exported_walks(finished, capsys, tmp_path):

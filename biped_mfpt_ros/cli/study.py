@@ -105,7 +105,9 @@ def _list(store: Store, args: argparse.Namespace) -> None:
                 "start": opened.settings.start.name,
                 "searcher": opened.settings.searcher,
                 "objectives": opened.settings.objectives,
+                "mu_s": opened.settings.mu_s,
                 "sigma_s": opened.settings.sigma_s,
+                "correlation": opened.settings.correlation,
                 "trials": sum(t.found is not None for t in trials),
                 "confirmed": sum(t.found is not None and t.found.confirmed for t in trials),
                 "best": None if best is None or best.found is None else best.found.values,
@@ -114,7 +116,8 @@ def _list(store: Store, args: argparse.Namespace) -> None:
     if args.json:
         print(json_text({"store": args.store, "studies": rows}))
         return
-    headers = ("study", "start", "searcher", "sigma", "trials", "confirmed", "best MFPT", "COT")
+    headers = ("study", "start", "searcher", "mean", "sigma", "correlation", "trials", "confirmed",
+               "best MFPT", "COT")  # fmt: skip
     print(
         table(
             headers,
@@ -123,7 +126,9 @@ def _list(store: Store, args: argparse.Namespace) -> None:
                     row["study"],
                     row["start"],
                     row["searcher"],
+                    f"{np.degrees(row['mu_s']):g} deg",
                     f"{np.degrees(row['sigma_s']):g} deg",
+                    f"{row['correlation']:g}",
                     row["trials"],
                     row["confirmed"],
                     (row["best"] or {}).get("mfpt"),
