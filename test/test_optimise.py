@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import signal
 import sqlite3
 import threading
@@ -14,6 +15,7 @@ import pytest
 from cmaes import CMA
 from scipy.optimize import minimize
 
+from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.cli.study import run_rows, summary_text
 from biped_mfpt_ros.control import hzd
 from biped_mfpt_ros.control.controller import catalogue, controller
@@ -24,7 +26,7 @@ from biped_mfpt_ros.optimise.scoring import Evaluation, Stopped
 from biped_mfpt_ros.optimise.searchers import SEARCHERS, CmaEs, Told, make_searcher
 from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.space import SearchSpace
-from biped_mfpt_ros.optimise.store import Store
+from biped_mfpt_ros.optimise.store import Store, StoreBusy
 from biped_mfpt_ros.optimise.study import Study, best_trial, confirming
 from biped_mfpt_ros.report.studies import front
 from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
@@ -335,6 +337,23 @@ def test_a_new_store_waits_for_another_that_writes_to_it(tmp_path):
     Store(tmp_path / "s.sqlite").close()
     release.join()
     other.close()
+
+
+@pytest.mark.parametrize("new", [True, False])
+def test_a_store_that_another_never_ceases_to_write_to_says_so(tmp_path, monkeypatch, capsys, new):
+    path = tmp_path / "s.sqlite"
+    monkeypatch.setattr(store_module, "_WAIT_SECONDS", 0.1)
+    store = None if new else Store(path)
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    said = f"store {path}: someone else has been writing to it for 0.1 s; try again when "
+    with pytest.raises(StoreBusy, match=re.escape(said)):
+        (store or Store(path)).create("test", SETTINGS)
+    assert main(["optimise", "--controller", "hzd/mfpt", "--local", "--store", str(path)]) == 1
+    assert said in capsys.readouterr().err
+    other.close()
+    if store is not None:
+        store.close()
 
 
 @pytest.mark.parametrize("owner", ["elsewhere:1:0", None])

@@ -42,7 +42,7 @@ from biped_mfpt_ros.nodes.warm_up import compiled
 from biped_mfpt_ros.optimise.scoring import BackendLost
 from biped_mfpt_ros.optimise.settings import Stage, StudySettings
 from biped_mfpt_ros.optimise.space import SearchSpace
-from biped_mfpt_ros.optimise.store import Store, Trial
+from biped_mfpt_ros.optimise.store import Store, StoreBusy, Trial
 from biped_mfpt_ros.optimise.study import Study, best_trial
 from biped_mfpt_ros.report.tables import plural
 
@@ -143,7 +143,7 @@ class Optimiser(Node):
         result = Optimise.Result()
         try:
             ended = self._run(goal, result)
-        except (InputError, BackendLost) as error:
+        except (InputError, BackendLost, StoreBusy) as error:
             result.message = str(error)
             self.get_logger().warning(f"a study ended: {error}")
             goal.abort()

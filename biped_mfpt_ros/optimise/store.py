@@ -50,6 +50,10 @@ CREATE INDEX IF NOT EXISTS generations ON trials (study, generation);
 """
 
 
+class StoreBusy(RuntimeError):
+    """Someone else has been writing to a store for longer than others wait for it."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """A candidate of a study.
@@ -115,6 +119,8 @@ class Store:
     ------
     InputError
         If the file holds something else.
+    StoreBusy
+        If someone else writes to it all the time that is waited; so do all methods that write.
     """
 
     def __init__(self, path: Path) -> None:
@@ -126,10 +132,11 @@ class Store:
             path, timeout=_WAIT_SECONDS, isolation_level=None, check_same_thread=False
         )
         try:
-            self._use_wal()
-            # A commit that is lost with the power costs a trial, and a sync costs milliseconds.
-            self._database.execute("PRAGMA synchronous = NORMAL")
-            (version,) = self._database.execute("PRAGMA user_version").fetchone()
+            with self._patience():
+                self._use_wal()
+                # A commit that is lost with the power costs a trial, and a sync milliseconds.
+                self._database.execute("PRAGMA synchronous = NORMAL")
+                (version,) = self._database.execute("PRAGMA user_version").fetchone()
             if version not in (0, _VERSION):
                 raise InputError("store", str(path), f"a store of version {_VERSION}")
             with self._transaction():
@@ -160,9 +167,23 @@ class Store:
             self._database.close()
 
     @contextmanager
+    def _patience(self) -> Iterator[None]:
+        """Say so when it has come to an end."""
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            if "locked" not in str(error):
+                raise
+            raise StoreBusy(
+                f"store {self.path}: someone else has been writing to it for {_WAIT_SECONDS:g} s; "
+                "try again when that is done, or end the process that has the file open"
+            ) from None
+
+    @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         with self._lock:
-            self._database.execute("BEGIN IMMEDIATE")
+            with self._patience():
+                self._database.execute("BEGIN IMMEDIATE")
             try:
                 yield self._database
             except BaseException:
@@ -171,7 +192,7 @@ class Store:
             self._database.execute("COMMIT")
 
     def _rows(self, query: str, *values: Any) -> list[Any]:
-        with self._lock:
+        with self._lock, self._patience():
             return self._database.execute(query, values).fetchall()
 
     # Studies ------------------------------------------------------------------------------------
