@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from biped_mfpt_ros.bench import __main__ as bench
@@ -48,3 +49,14 @@ def test_chains_of_the_benchmark_settle_and_are_exact():
         assert mesh.targets[1, len(mesh.slopes) // 2] == 1  # x_2, on flat ground
         sigmas = chain._SIGMAS[[0, 1, 25, 49]]
         assert chain.check_chain(chain._solved(mesh, sigmas), sigmas) < 1e-10
+
+
+def test_correlated_chains_of_the_benchmark_settle_and_are_exact():
+    sigmas = chain._SIGMAS[[0, 7]]
+    for states in (chain._WITH_SLOPES, 10_000, 20_000):
+        mesh = chain.chain_mesh(states)
+        _, slopes = np.nonzero(mesh.targets)
+        assert (mesh.preceding[mesh.targets[mesh.targets > 0]] == slopes).all()
+        found = chain._solved(mesh, sigmas, correlation=0.5)
+        assert chain.check_chain(found, sigmas, 0.5) < 1e-10
+        assert found[0].mfpt < 0.9 * chain._solved(mesh, sigmas[:1])[0].mfpt

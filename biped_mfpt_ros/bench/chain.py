@@ -3,7 +3,8 @@
 The chains are walkers' in a model that is solved exactly: an offset from the limit cycle, which a
 slope pushes and a step contracts, in whole degrees; beyond 30 degrees is a fall. Each of its 61
 states is copied, and the copy tells the slopes of the last steps apart, as the states of a mesh do.
-States are numbered as they are found. The MFPT is that of the 61 states, for any number of copies.
+States are numbered as they are found. The MFPT is that of the 61 states, for any number of copies;
+where slopes are correlated, that of 61 states times 81 slopes before them.
 92 % of the transitions do not fall, against 11 % in the mesh of hzd/mfpt: this is the harder case.
 
 The states to search are those of a mesh of hzd/mfpt, made more by random states between neighbours
@@ -29,8 +30,7 @@ from biped_mfpt_ros.chain.markov import (
     ChainError,
     Metastability,
     metastabilities,
-    slope_probabilities,
-    solve_chain,
+    metastability,
 )
 from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, Mesh, grow_mesh
 from biped_mfpt_ros.chain.nearest import STATE_SIZE, StateSet
@@ -45,6 +45,8 @@ from biped_mfpt_ros.walker.robot import WalkerModel
 
 _HALF, _CONTRACTION = 30, 0.85
 _REACHED = 0.752  # share of the copies that are found
+_WITH_SLOPES = 3_716  # states of a chain in which each knows the slope before it, and no other
+_CORRELATION = 0.5
 _SIGMAS = np.radians(np.geomspace(1.2, 8.0, 50))  # MFPT from 65 to some 1e38
 
 
@@ -99,14 +101,15 @@ def chain_mesh(states: int) -> Mesh:
     targets = np.zeros((most, m), dtype=np.uint32)
     number, queue = np.zeros(most, dtype=np.uint32), np.empty(most, dtype=np.int64)
     n = _copied(small, copies, number, queue, targets)
+    # Copy m k + s comes after slope s, also modulo a multiple of m.
+    preceding = (queue[:n] % copies % m).astype(np.uint32)
     outcomes = np.where(targets[:n] == 0, Outcome.SWING_SCUFFS, Outcome.STEP).astype(np.uint8)
     outcomes[0] = NOT_SIMULATED
-    nothing = np.zeros(n, np.uint32)
     return Mesh(
         slopes=SLOPES,
         states=np.zeros((n, STATE_SIZE)),
-        preceding=nothing,
-        generation=nothing,
+        preceding=preceding,
+        generation=np.zeros(n, np.uint32),
         targets=targets[:n].copy(),
         outcomes=outcomes,
         scales=np.ones(STATE_SIZE),
@@ -115,25 +118,24 @@ def chain_mesh(states: int) -> Mesh:
     )
 
 
-def _solved(mesh: Mesh, sigmas: np.ndarray, threads: int | None = None) -> list[Metastability]:
+def _solved(
+    mesh: Mesh, sigmas: np.ndarray, threads: int | None = None, correlation: float = 0.0
+) -> list[Metastability]:
     out = []
-    for sigma, result in zip(
-        sigmas, metastabilities(mesh, 0.0, sigmas, threads=threads), strict=True
-    ):
+    found = metastabilities(mesh, 0.0, sigmas, threads=threads, correlation=correlation)
+    for sigma, result in zip(sigmas, found, strict=True):
         if isinstance(result, ChainError):
             raise BenchError(f"chain of {len(mesh.states)} states, sigma_s {sigma:g} rad: {result}")
         out.append(result)
     return out
 
 
-def check_chain(found: list[Metastability], sigmas: np.ndarray) -> float:
+def check_chain(found: list[Metastability], sigmas: np.ndarray, correlation: float = 0.0) -> float:
     """Largest relative error against the small chain; more than 1e-8 is an error."""
-    small = small_chain()
-    outcomes = np.where(small == 0, Outcome.SWING_SCUFFS, Outcome.STEP)
-    outcomes[0] = NOT_SIMULATED
+    small = chain_mesh(_WITH_SLOPES if correlation else 1)
     error = 0.0
     for sigma, result in zip(sigmas, found, strict=True):
-        exact = solve_chain(small, outcomes, slope_probabilities(SLOPES, 0.0, sigma)).mfpt
+        exact = metastability(small, 0.0, sigma, correlation).mfpt
         error = max(error, abs(result.mfpt / exact - 1.0))
     if not error <= 1e-8:
         raise BenchError(f"chain of {len(found[0].distribution)} states: error {error:g}")
@@ -178,6 +180,25 @@ def chain(states: int, sigmas: np.ndarray, section: Section) -> None:
         found[0].distribution.tobytes(),
     ):
         raise BenchError(f"chain of {n} states: other bits alone than among {len(sigmas)}")
+
+
+def correlated(states: int, sigmas: np.ndarray, repetitions: int, section: Section) -> None:
+    """Some sigmas on one chain in one thread, with correlated slopes and with independent ones."""
+    mesh = chain_mesh(states)
+    n = len(mesh.states)
+    seconds = {}
+    for correlation in (0.0, _CORRELATION):
+
+        def solve(correlation: float = correlation) -> list[Metastability]:
+            return _solved(mesh, sigmas, 1, correlation)
+
+        error = check_chain(solve(), sigmas, correlation)
+        seconds[correlation] = timed(solve, repetitions, time.thread_time)
+        name = f"chain of {n} states, {len(sigmas)} sigma_s, correlation {correlation:g}"
+        section.rows.append(row(name, seconds[correlation], 1, "s"))
+        section.facts[f"{name}: largest relative error"] = error
+    medians = {rho: float(np.median(values)) for rho, values in seconds.items()}
+    section.ratios[f"correlated_over_independent_{n}"] = medians[_CORRELATION] / medians[0.0]
 
 
 def assembly(states: int, section: Section) -> None:
@@ -310,6 +331,7 @@ def run(short: bool) -> Section:
     section = Section()
     for states in (2_000,) if short else (10_000, 100_000, 1_000_000):
         chain(states, _SIGMAS[:: 10 if short else 1], section)
+    correlated(10_000 if short else 100_000, _SIGMAS[:8], 3 if short else 5, section)
     assembly(2_000 if short else 1_000_000, section)
     small = chain_mesh(1)
     seconds = timed(lambda: _solved(small, _SIGMAS[:1]), 20 if short else 200)
