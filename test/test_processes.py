@@ -221,3 +221,18 @@ sys.exit(cli.main(["cycle"]))
     assert ended.returncode == code, ended.stderr
     assert ended.stdout == "all of it\n"
     assert ("in vain" in ended.stderr) == (code == cli.EXIT_FAILED)
+
+
+@pytest.mark.slow
+def test_compile_leaves_nothing_to_be_compiled(tmp_path):
+    def run(*arguments):
+        command = [sys.executable, "-m", "biped_mfpt_ros.cli", *arguments, "--quiet"]
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+        subprocess.run(command, env=environment, check=True, timeout=300)
+        return {file.name for file in tmp_path.rglob("*.nbc")}
+
+    compiled = run("compile")
+    assert compiled
+    chain = ("mfpt", "--sigma", "1", "2", "--slope-step", "1", "--threshold", "1")
+    assert run(*chain, "--scale-refresh", "addition") == compiled
+    assert run("monte-carlo", "--sigma", "2", "--walks", "10") == compiled

@@ -8,7 +8,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
+from scipy.sparse import csr_array
 
+from biped_mfpt_ros.chain.aggregation import metastable_distribution
+from biped_mfpt_ros.chain.markov import metastability
 from biped_mfpt_ros.chain.mesh import grow_mesh
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.control.controller import controller
@@ -48,9 +51,15 @@ def compile_all(say: Callable[[str], object]) -> None:
     with compiled(say, _WHAT):
         monte_carlo(walking, 0.1, 1, 0, state=state, threads=1)
         trace_swing(walking, state, 0.0, 0.0)
-        grow_mesh(
-            lambda states, previous: simulate_steps(walking, states, previous, slopes),
-            state,
-            slopes,
-            1.0,
-        )
+        for scale_refresh in ("generation", "addition"):
+            mesh = grow_mesh(
+                lambda states, previous: simulate_steps(walking, states, previous, slopes),
+                state,
+                slopes,
+                1.0,
+                scale_refresh=scale_refresh,
+            )
+        # Also what only few chains need: times from all states, and aggregation.
+        _ = metastability(mesh, 0.0, 0.01).mfpt_from_state
+        q = csr_array((np.full(4, 0.4), np.array([0, 1, 0, 1]), np.array([0, 2, 4])))
+        metastable_distribution(q, np.full(2, 0.2), 1e-9)

@@ -78,6 +78,7 @@ def _of_mesh(args: argparse.Namespace) -> Picture:
     mesh, _ = grow(args)
     if args.kind == "mesh":
         return mesh_pictures.mesh_plane(mesh, args.controller)
-    found = metastability(mesh, mean, sigma, correlation)
+    with work(args.quiet):
+        found = metastability(mesh, mean, sigma, correlation)
     draw = mesh_pictures.where_it_falls if args.kind == "falls" else mesh_pictures.mesh_distribution
     return draw(mesh, found, mean, sigma, args.controller, correlation)
