@@ -196,7 +196,9 @@ def _label_plane(axes: Axes, plane: Plane) -> None:
 def _mark_start(axes: Axes, plane: Plane) -> None:
     axes.plot(*plane.scores[:1, :2].T, "o", color=PAPER, markersize=9, fillstyle="none",
               markeredgewidth=1.8, label="flat limit cycle")  # fmt: skip
-    axes.legend(loc="upper left", fontsize=8.5, handletextpad=0.2, borderaxespad=0.2)
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8.5, handletextpad=0.2, frameon=False
+    )  # above the axes, where no state is
 
 
 def _variance_text(plane: Plane) -> str:
