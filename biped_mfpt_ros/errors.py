@@ -13,7 +13,7 @@ class InputError(ValueError):
     field : str
         Name of the field, parameter, option or file that holds the value.
     value : object
-        The value itself; long ones are shortened in the text.
+        The value itself, None if it is missing; long ones are shortened in the text.
     allowed : str
         What would have been allowed.
     """
@@ -25,4 +25,5 @@ class InputError(ValueError):
         shown = str(value) if isinstance(value, Number) else repr(value)  # numpy's, too
         if len(shown) > 200:
             shown = shown[:197] + "..."
-        super().__init__(f"{field}: {shown} is not allowed; allowed: {allowed}")
+        problem = "missing" if value is None else f"{shown} is not allowed"
+        super().__init__(f"{field}: {problem}; allowed: {allowed}")

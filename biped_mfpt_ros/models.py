@@ -23,8 +23,8 @@ def in_order(values: Mapping[str, Any], names: Sequence[str], field: str) -> lis
     if not isinstance(values, Mapping):
         raise InputError(field, values, "an object with " + ", ".join(names))
     if wrong := sorted(set(values) ^ set(names)):
-        what = "unknown" if wrong[0] in values else "missing"
-        raise InputError(f"{field}.{wrong[0]}", what, "exactly " + ", ".join(names))
+        # The value of one that is unknown, None of one that is missing.
+        raise InputError(f"{field}.{wrong[0]}", values.get(wrong[0]), "exactly " + ", ".join(names))
     return [values[name] for name in names]
 
 
@@ -61,7 +61,7 @@ def robot_from_file(path: str | Path) -> Robot:
     except InputError as error:
         raise InputError(f"{path}: {error.field}", error.value, error.allowed) from None
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError("robot file", str(path), f"a JSON file ({error})") from None
+        raise InputError("robot_file", str(path), f"a JSON file ({error})") from None
 
 
 def model_values(model: WalkerModel) -> dict[str, Any]:

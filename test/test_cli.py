@@ -154,6 +154,31 @@ class TestInProcess:
         assert result["mean_steps"] == expected.mean_steps
         assert result["paper"] is None
 
+    def test_monte_carlo_without_a_fall_gives_a_bound(self, capsys):
+        arguments = ("monte-carlo", "--controller", "hzd/mfpt", "--sigma", "0.01", "--walks", "3")
+        assert main([*arguments, "--max-steps", "10"]) == 0
+        text = capsys.readouterr().out
+        # 27 steps after the first ones: (1 - 1 / 9.0)^27 is about 5 %.
+        assert text.startswith("hzd/mfpt: no fall; 95 % confidence: more than 9.0128 steps")
+        assert "3 stopped after 10 steps" in text
+
+    @pytest.mark.parametrize(
+        ("arguments", "note"),
+        [
+            (["--sigma", "0.1"], "sigma 0.1 deg is finer than the slope set"),
+            (["--sigma", "1", "--correlation", "0.9"], "at most 0.43589 deg"),
+            (["--sigma", "5", "--slope-limit", "5"], "once in 3.1515 steps"),
+            (["--sigma", "5", "--controller", "hzd/robust"], "once in 15787 steps"),
+            (["--sigma", "1"], None),
+        ],
+    )
+    def test_slope_sets_that_do_not_serve_a_sigma(self, capsys, arguments, note):
+        arguments = ["mfpt", "--slope-step", "0.5", "--threshold", "0.3", *arguments]
+        notes = run_json(capsys, *arguments)["notes"]
+        assert (note in notes[0]) if note else notes == []
+        assert main([*arguments, "--quiet"]) == 0
+        assert "\n".join(notes) in capsys.readouterr().out
+
     def test_controllers(self, capsys):
         result = run_json(capsys, "controllers")
         names = [row["controller"] for row in result["controllers"]]
@@ -161,6 +186,11 @@ class TestInProcess:
         assert names[:6] == paper
         assert sorted(names) == sorted(controller_names())
         assert result["controllers"][2]["mfpt"] == 113.1
+        assert main(["controllers"]) == 0
+        limits = "--torque-limit 120 --slip-duration 0.008 --friction-frame vertical"
+        assert f"smc/cot     {limits}\n" in capsys.readouterr().out
+        result = run_json(capsys, "cycle", "--controller", "smc/cot", *limits.split())
+        assert result["stable"]
 
 
 class TestBadInput:
@@ -179,7 +209,10 @@ class TestBadInput:
             (["step", "--state", STATE, "--slip-duration", "-1"], "--slip-duration", "-1"),
             (["step", "--state", STATE, "--time-limit", "0"], "--time-limit", "0.0"),
             (["step", "--state", STATE, "--tolerance", "1"], "--tolerance", "1"),
+            (["step", "--state", "206,173,-23,-18,0,21,-90,-145,28,13"], "--state", "rad"),
             (["step"], "--state", None),
+            (["cycle", "--controller", "hzd/cot", "--controller-file", "x"], "--controller", None),
+            (["cycle", "--robot-file", "none.json"], "--robot-file", "none.json"),
             (["monte-carlo", "--sigma", "-2"], "--sigma", "-2"),
             (["monte-carlo", "--sigma", "inf"], "--sigma", "inf"),
             (["monte-carlo", "--sigma", "two"], "--sigma", "two"),
@@ -191,7 +224,7 @@ class TestBadInput:
                 "0.5",
             ),
             (["run", "--correlation", "1"], "--correlation", "1.0"),
-            (["inspect", "bag", "--correlation", "0.5"], "--sigma", "None"),
+            (["inspect", "bag", "--correlation", "0.5"], "--sigma", "missing"),
             (["optimise", "--local", "--correlation", "2"], "--correlation", "2.0"),
             (
                 ["picture", "falls", "--output", "x.png", "--correlation", "1"],
@@ -224,6 +257,8 @@ class TestBadInput:
             (["inspect", "no/such/bag"], "BAG", "no/such/bag"),
             (["inspect", "bag", "--sigma", "-1"], "--sigma", "-1"),
             (["node", "nothing"], "NAME", "nothing"),
+            (["node", "mesher", "--namespace", "x"], "argument", "--namespace"),
+            (["reproduce", "--controllers", "hzd/none"], "--controllers", "hzd/none"),
             (["dance"], "COMMAND", "dance"),
             ([], "COMMAND", None),
             (["cycle", "--slop", "1"], "--slop", None),
@@ -236,6 +271,22 @@ class TestBadInput:
         if value is not None:
             assert value in line
             assert "allowed: " in line or "choose from" in line
+
+    @pytest.mark.parametrize(
+        ("change", "problem"),
+        [
+            ({"name": None}, "name: missing; allowed: an object with name, scheme and parameters"),
+            ({"scheme": "hdz"}, "scheme: 'hdz' is not allowed; allowed: one of hzd"),
+            ({"parameters": {}}, "parameters.alpha_0^1: missing; allowed: exactly kp, kd"),
+            ({"parameters": {"a": 1.0}}, "parameters.a: 1.0 is not allowed; allowed: exactly kp"),
+            ({"parameters": [1.0]}, "parameters: 'length 1' is not allowed"),
+        ],
+    )
+    def test_controller_files(self, capsys, tmp_path, change, problem):
+        path = tmp_path / "mine.json"
+        values = {"name": "mine", "scheme": "hzd", "parameters": [1.0]} | change
+        path.write_text(json.dumps({k: v for k, v in values.items() if v is not None}))
+        assert f"{path}: {problem}" in run_bad(capsys, "cycle", "--controller-file", str(path))
 
     def test_missing_ros(self, capsys, monkeypatch):
         monkeypatch.setitem(sys.modules, "rclpy", None)
@@ -715,7 +766,7 @@ class TestRun:
         assert [row["mfpt"] for row in mesh["estimates"]] == [
             row["mfpt"] for row in alone["estimates"]
         ]
-        assert main(["inspect", str(tmp_path / "run" / "bag")]) == 0
+        assert main(["inspect", str(tmp_path / "run")]) == 0
         assert repr(mesh["estimates"][0]["mfpt"]) in capsys.readouterr().out
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

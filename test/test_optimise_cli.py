@@ -111,7 +111,7 @@ def test_what_is_exported_walks(finished, capsys, tmp_path):
     assert first["trial"] == 0
     file.write_text("{}")
     assert main(["cycle", "--controller-file", str(file)]) == 2
-    assert "--controller-file" in capsys.readouterr().err
+    assert f"{file}: name: missing" in capsys.readouterr().err
 
 
 def test_a_front_is_confirmed_on_a_finer_mesh(finished, capsys):
@@ -172,11 +172,12 @@ def test_the_papers_controllers_are_where_the_paper_has_them(finished):
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        (["--searcher", "luck"], "--searcher: 'luck'"),
-        (["--objective", "mfpt", "beauty"], "objectives: 'beauty'"),
+        (["--searcher", "luck"], "--searcher: invalid choice: 'luck' (choose from"),
+        (["--confirm", "nothing"], "--confirm: 'nothing'"),
+        (["--objective", "mfpt", "beauty"], "--objective: 'beauty'"),
         (["--limit", "speed_min=x"], "'speed_min=x' is not allowed"),
-        (["--limit", "weight_max=3"], "limits: 'weight_max'"),
-        (["--fix", "omega"], "omega"),
+        (["--limit", "weight_max=3"], "--limit: 'weight_max'"),
+        (["--fix", "omega"], "--fix: 'omega'"),
         (["--sigma", "0"], "--sigma: 0.0"),
         (["--runs", "-1"], "runs: -1 is not allowed; allowed: 0 to"),
         (["--runs", "2", "--searcher", "pattern"], "runs: 2 is not allowed"),

@@ -121,9 +121,12 @@ def _run(args: argparse.Namespace) -> int:
 # Fields of the core that are not called as the options that set them.
 _OPTIONS = {
     "bag": "BAG",
+    "fixed": "--fix",
+    "limits": "--limit",
     "mu_s": "--mean",
     "sigma_s": "--sigma",
     "mu_s_deg": "--mean",
+    "objectives": "--objective",
     "sigma_s_deg": "--sigma",
     "states": "--state",
     "slope_step_deg": "--slope-step",

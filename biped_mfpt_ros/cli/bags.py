@@ -6,6 +6,7 @@ import argparse
 import math
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from biped_mfpt_ros.cli import EXIT_FAILED, options
@@ -27,6 +28,8 @@ def inspect(args: argparse.Namespace) -> int:
         if value is not None and not sigmas:
             allowed = f"at least one standard deviation to go with {option}"
             raise InputError("--sigma", None, allowed)
+    if (Path(args.bag) / "bag").is_dir():  # the directory of a run
+        args.bag = str(Path(args.bag) / "bag")
     require_ros("biped_mfpt_msgs.msg")
     from biped_mfpt_ros.bag.repair import salvage
     from biped_mfpt_ros.bag.report import inspect_bag

@@ -14,7 +14,7 @@ from biped_mfpt_ros.cli import options
 from biped_mfpt_ros.cli.growth import Growth
 from biped_mfpt_ros.cli.kernels import work
 from biped_mfpt_ros.cli.output import json_text
-from biped_mfpt_ros.cli.results import estimate_row, mfpt_table
+from biped_mfpt_ros.cli.results import estimate_row, mfpt_table, slope_set_notes
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.files import whole_file
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
@@ -59,7 +59,8 @@ def mfpt(args: argparse.Namespace) -> None:
     grown, result = grow(args)
     start = time.perf_counter()
     estimates = []
-    solved = metastabilities(grown, mean, sigmas, correlation=correlation)
+    with work(args.quiet):
+        solved = metastabilities(grown, mean, sigmas, correlation=correlation)
     for sigma_deg, found in zip(args.sigma, solved, strict=True):
         if isinstance(found, ChainError):
             raise found
@@ -72,6 +73,9 @@ def mfpt(args: argparse.Namespace) -> None:
         "mu_s": mean,
         "correlation": correlation,
         "estimates": estimates,
+        "notes": slope_set_notes(
+            estimates, args.slope_step, args.slope_limit, args.mean, correlation
+        ),
         "chain_seconds": time.perf_counter() - start,
     }
     if args.json:
@@ -80,6 +84,8 @@ def mfpt(args: argparse.Namespace) -> None:
     print(_mesh_text(result) + ground_text(args.mean, correlation))
     print()
     print(mfpt_table(estimates))
+    if result["notes"]:
+        print("\n" + "\n".join(result["notes"]))
 
 
 def grow(args: argparse.Namespace) -> tuple[Mesh, dict[str, Any]]:

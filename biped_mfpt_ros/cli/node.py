@@ -10,6 +10,7 @@ import signal
 import sys
 
 from biped_mfpt_ros.cli import CommandError
+from biped_mfpt_ros.errors import InputError
 
 ROS_MISSING = (
     "this command needs ROS 2 and the package biped_mfpt_msgs, and {module!r} cannot be imported. "
@@ -23,6 +24,12 @@ def node(args: argparse.Namespace) -> int:
     """Run a node's main function with the arguments that follow its name."""
     if args.end_with is not None:
         end_with(args.end_with)
+    first = args.arguments[0] if args.arguments else "--ros-args"
+    if first in ("-h", "--help"):
+        args.parser.print_help()
+        return 0
+    if first != "--ros-args":
+        raise InputError("argument", first, "--ros-args, and what ROS takes after that")
     require_ros()
     main = importlib.import_module(f"biped_mfpt_ros.nodes.{args.name}").main
     sys.argv = [args.name, *args.arguments]

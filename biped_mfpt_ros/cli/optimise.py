@@ -37,7 +37,10 @@ def optimise(args: argparse.Namespace) -> None:
         )  # fmt: skip
     else:
         store = Store(Path(args.store))
-        other = Study(store, args.confirm)
+        try:
+            other = Study(store, args.confirm)
+        except InputError as error:
+            raise InputError("--confirm", error.value, error.allowed) from None
         model = replace(other.settings.model, tolerance=options.model_of(args).tolerance)
         settings = confirming(other, model=model, **_scoring(args))
         name = args.study or f"{args.confirm}-confirmed"

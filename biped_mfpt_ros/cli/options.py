@@ -45,6 +45,9 @@ def controller_from_file(path: str, robot: Robot) -> Controller:
     """
     try:
         data = json.loads(Path(path).read_text())
+        for field in ("name", "scheme", "parameters"):
+            if field not in data:
+                raise InputError(field, None, "an object with name, scheme and parameters")
         scheme, parameters = data["scheme"], data["parameters"]
         if scheme not in SCHEMES:
             raise InputError("scheme", scheme, "one of " + ", ".join(SCHEMES))
@@ -54,7 +57,7 @@ def controller_from_file(path: str, robot: Robot) -> Controller:
         made.packed(robot)  # checks ranges
     except InputError as error:
         raise InputError(f"{path}: {error.field}", error.value, error.allowed) from None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         reason = f"a JSON file with name, scheme and parameters ({error})"
         raise InputError("--controller-file", path, reason) from None
     return made

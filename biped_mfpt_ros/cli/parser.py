@@ -81,7 +81,7 @@ def make_parser() -> Parser:
         "node",
         help="start one node of the pipeline",
         description="Start one node of the pipeline, like `ros2 run biped_mfpt_ros NAME`, where "
-        "there is no ros2\ncommand. All that follows NAME goes to the node.",
+        "there is no ros2\ncommand. What follows NAME goes to the node.",
         epilog="examples:\n"
         "  biped-mfpt node simulator\n"
         "  biped-mfpt node mesher --ros-args -r __ns:=/rough --log-level debug",
@@ -91,7 +91,8 @@ def make_parser() -> Parser:
         "--end-with", type=int, metavar="PID", help=argparse.SUPPRESS
     )  # of a parent that may be killed
     node.add_argument("name", choices=NODES, metavar="NAME", help=", ".join(NODES))
-    node.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    rest = node.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    rest.required = False  # is no part of the error when NAME is missing
 
     add(
         "compile",

@@ -24,7 +24,13 @@ from biped_mfpt_ros.cli.kernels import compile_all
 from biped_mfpt_ros.cli.node import require_ros
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.processes import Child, Processes
-from biped_mfpt_ros.cli.results import beside_paper, estimate_row, mfpt_table, monte_carlo_result
+from biped_mfpt_ros.cli.results import (
+    beside_paper,
+    estimate_row,
+    mfpt_table,
+    monte_carlo_result,
+    slope_set_notes,
+)
 from biped_mfpt_ros.cli.shared_memory import remove_left_segments
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
@@ -116,6 +122,9 @@ def run(args: argparse.Namespace) -> None:
         pipeline.start(workers, args.mean, args.sigma, correlation, checkpoint=checkpoint)
         result |= pipeline.mesh(
             settings, mean, dict(zip(sigmas, args.sigma, strict=True)), correlation
+        )
+        result["notes"] = slope_set_notes(
+            result["estimates"], args.slope_step, args.slope_limit, args.mean, correlation
         )
         # The walks can have all cores, and the bag is closed whatever happens to them.
         progress.show("stopping the nodes")
@@ -477,6 +486,8 @@ def _report(result: dict[str, Any]) -> str:
             )
         headers = ("sigma", "Monte Carlo", "95 % confidence", "paper", "difference")
         parts.append(table(*beside_paper(headers, rows)))
+    if result["notes"]:
+        parts.append("\n".join(result["notes"]))
     parts.append(
         "A coarse mesh errs, ours and the paper's. Its MFPT settles as --threshold shrinks;\n"
         "where the robot falls soon enough, `biped-mfpt monte-carlo` is the judge."

@@ -8,8 +8,9 @@ from typing import Any
 
 from biped_mfpt_ros.gait.monte_carlo import MonteCarlo
 from biped_mfpt_ros.report import paper
-from biped_mfpt_ros.report.tables import difference, table
+from biped_mfpt_ros.report.tables import difference, number, table
 from biped_mfpt_ros.walker.outcome import Outcome
+from biped_mfpt_ros.walker.terrain import spread_given_last
 
 
 def monte_carlo_result(result: MonteCarlo) -> dict[str, Any]:
@@ -36,7 +37,7 @@ def shares_table(values: Mapping[Any, float]) -> str:
     rows = [
         (name.replace("_", " "), f"{100.0 * share:.1f} %") for name, share in shares(values).items()
     ]
-    return table(("fall", "share"), rows) if rows else "no falls"
+    return table(("fall", "share"), rows)
 
 
 def estimate_row(
@@ -64,7 +65,8 @@ def mfpt_table(estimates: Sequence[dict[str, Any]]) -> str:
     rows = []
     for row in estimates:
         falls = [f"{name.replace('_', ' ')} {100.0 * share:.0f} %"
-                 for name, share in list(row["failure_shares"].items())[:3]]  # fmt: skip
+                 for name, share in list(row["failure_shares"].items())[:3]
+                 if share >= 0.005]  # fmt: skip
         reference = row["paper"]
         rows.append(
             (
@@ -76,6 +78,33 @@ def mfpt_table(estimates: Sequence[dict[str, Any]]) -> str:
             )
         )
     return table(*beside_paper(("sigma", "MFPT in steps", "paper", "difference", "falls"), rows))
+
+
+def slope_set_notes(
+    estimates: Sequence[dict[str, Any]],
+    step_deg: float,
+    limit_deg: float,
+    mean_deg: float,
+    correlation: float,
+) -> list[str]:
+    """What estimates lack because their slope set is too coarse or too narrow."""
+    notes = []
+    for row in estimates:
+        sigma_deg = row["sigma_s_deg"]
+        spread, scale = spread_given_last(sigma_deg, correlation), math.sqrt(2.0) * sigma_deg
+        beyond = 0.5 * sum(math.erfc((limit_deg + m) / scale) for m in (mean_deg, -mean_deg))
+        if spread < step_deg:
+            known = ", given the slope before," if correlation else ""
+            notes.append(
+                f"sigma {sigma_deg:g} deg{known} is finer than the slope set: take a --slope-step "
+                f"of at most {number(spread)} deg"
+            )
+        elif beyond * max(row["mfpt"], 100.0) > 1.0:  # sooner than a fall, or common
+            notes.append(
+                f"sigma {sigma_deg:g} deg has a slope beyond --slope-limit {limit_deg:g} once in "
+                f"{number(1.0 / beyond)} steps, which the mesh leaves out: take a larger limit"
+            )
+    return notes
 
 
 def beside_paper(

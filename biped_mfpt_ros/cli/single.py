@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,13 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo as walk
 from biped_mfpt_ros.gait.step import check_states, simulate_steps
-from biped_mfpt_ros.models import robot_from_file
+from biped_mfpt_ros.models import model_values, robot_from_file
 from biped_mfpt_ros.optimise.space import PARAMETRISATIONS
 from biped_mfpt_ros.report import paper
 from biped_mfpt_ros.report.tables import ground_text, number, plural, table
+from biped_mfpt_ros.study.readings import readings
 from biped_mfpt_ros.walker.outcome import Outcome
+from biped_mfpt_ros.walker.robot import WalkerModel
 
 
 def step(args: argparse.Namespace) -> None:
@@ -34,6 +37,8 @@ def step(args: argparse.Namespace) -> None:
     controller, model = options.walker_of(args)
     previous = options.slope("--previous-slope", args.previous_slope)
     slope = options.slope("--slope", args.slope)
+    if np.abs(args.state[:5]).max() > 2.0 * np.pi:  # degrees, most likely
+        raise InputError("--state", args.state, "angles within a turn, in rad")
     states = check_states([args.state])
     with work(args.quiet):
         steps = simulate_steps(controller, states, [previous], [slope], model)
@@ -130,15 +135,20 @@ def monte_carlo(args: argparse.Namespace) -> None:
         return
     low, high = result.confidence_interval
     confidence = f", 95 % confidence {number(low)} to {number(high)}" if result.falls > 1 else ""
-    print(
-        f"{controller.name}: {number(result.mean_steps)} steps to a fall on average"
-        f"{_beside(reference)}{confidence}"
-    )
+    mean_steps = f"{number(result.mean_steps)} steps to a fall on average"
+    if result.counted.size and not result.falls:
+        # Of a constant chance of falling p: (1 - p)^n = 5 % for n steps without a fall.
+        least = result.counted.sum() / -math.log(0.05)
+        mean_steps = f"no fall; 95 % confidence: more than {number(float(least))} steps to a fall"
+    print(f"{controller.name}: {mean_steps}{_beside(reference)}{confidence}")
+    ended = int((result.outcomes == Outcome.STEP).sum())
+    stopped = f", {ended} stopped after {args.max_steps} steps" if ended else ""
     print(
         f"{plural(args.walks, 'walk')}, {result.counted.size} counted (more than one step), "
-        f"{plural(result.falls, 'fall')}{ground_text(args.mean, correlation)}"
+        f"{plural(result.falls, 'fall')}{stopped}{ground_text(args.mean, correlation)}"
     )
-    print(shares_table(result.failure_shares))
+    if result.falls:
+        print(shares_table(result.failure_shares))
 
 
 def controllers(args: argparse.Namespace) -> None:
@@ -160,7 +170,7 @@ def controllers(args: argparse.Namespace) -> None:
         print(json_text({"name": "mine", "scheme": one.scheme, "parameters": parameters}))
         return
     papers = paper_controller_names()
-    rows = [paper.figures(name) for name in papers]
+    rows = [paper.figures(name) | {"model": readings()[name].settings} for name in papers]
     others: list[dict[str, Any]] = [
         {"controller": n, "origin": origin(n), "confirmed": confirmed(n)}
         for n in catalogue()
@@ -185,7 +195,12 @@ def controllers(args: argparse.Namespace) -> None:
             ],
         )
     )
-    print("\nAs the paper gives them; speed in m/s, MFPT and Monte Carlo in steps. Found here:\n")
+    print("\nAs the paper gives them; speed in m/s, MFPT and Monte Carlo in steps. It states no")
+    print("limits; those that serve its numbers best are the defaults for hzd, and for smc\n")
+    for row in rows:
+        if limits := _limits_text(row["model"]):
+            print(f"{row['controller']:<10}  {limits}")
+    print("\nFound here:\n")
     found = [(row["controller"], row["confirmed"]) for row in others if row["confirmed"]]
     print(
         table(
@@ -206,6 +221,16 @@ def controllers(args: argparse.Namespace) -> None:
     print("\nWhere they come from:\n")
     for row in others:
         print(f"{row['controller']}: {row['origin']}")
+
+
+def _limits_text(model: dict[str, Any]) -> str:
+    """What sets a model apart from the default, as options."""
+    default = model_values(WalkerModel())
+    return " ".join(
+        f"--{name.replace('_', '-')} {number(value)}"
+        for name, value in model.items()
+        if value != default[name]
+    )
 
 
 def _beside(reference: float | None) -> str:

@@ -48,13 +48,13 @@ def study(args: argparse.Namespace) -> None:
 def _names(args: argparse.Namespace, least: int, most: int) -> list[str]:
     if not least <= len(args.study) <= most:
         wanted = "one name of a study" if most == 1 else "names of studies"
-        raise InputError("STUDY", args.study, wanted)
+        raise InputError("STUDY", args.study or None, wanted)
     return list(args.study)
 
 
 def _save(picture: Any, args: argparse.Namespace) -> None:
-    if args.output is None:
-        raise InputError("--output", None, f"a new file, for {args.what}")
+    if args.output is None or not args.output.lower().endswith(".png"):
+        raise InputError("--output", args.output, "a new file that ends in .png")
     picture.save(args.output)
     if args.json:
         print(json_text({"output": args.output, "caption": picture.caption}))
@@ -184,7 +184,7 @@ def summary_text(study: Study, trials: list[Trial], top: int = 5) -> str:
                 f"best score {score_text(row)}{ended}"
             )
         if len(left) > 1:
-            lines.append(f"{len(left)} runs share the trials until one is left: it takes more")
+            lines.append(f"{len(left)} runs share the trials until one is left: that takes more")
     confirmed = sorted(
         ((t.number, t.found) for t in done if t.found is not None and t.found.confirmed),
         key=lambda trial: (-trial[1].score, trial[0]),
@@ -243,7 +243,7 @@ def _export(opened: Study, args: argparse.Namespace) -> None:
     else:
         found = [t for t in trials if t.number == args.trial and t.found is not None]
         if not found:
-            raise InputError("--trial", args.trial, f"a finished one of {len(trials)} trials")
+            raise InputError("--trial", args.trial, "a finished trial of the study")
         trial = found[0]
     assert trial.found is not None
     text = json_text(

@@ -199,7 +199,7 @@ def make_plan(
     papers = paper_controller_names()
     for name in controllers or ():
         if name not in papers:
-            raise InputError("controller", name, "one of " + ", ".join(papers))
+            raise InputError("controllers", name, "one of " + ", ".join(papers))
     names = tuple(n for n in papers if not controllers or n in controllers)
     walks = (QUICK_WALKS if quick else WALKS) if walks is None else walks
     if walks < 2:

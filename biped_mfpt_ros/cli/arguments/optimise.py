@@ -65,6 +65,7 @@ examples:
     )
     optimise.add_argument(
         "--searcher",
+        choices=("cma-es", "nelder-mead", "pattern", "nsga2"),
         default="cma-es",
         metavar="NAME",
         help="cma-es, nelder-mead, pattern or nsga2 (default: %(default)s)",
@@ -211,8 +212,8 @@ be put into data/controllers.json.
 
 examples:
   biped-mfpt study list
-  biped-mfpt study show hzd-mfpt-cma-es-1 --top 20
-  biped-mfpt study export hzd-mfpt-cma-es-1 --output best.json
+  biped-mfpt study show hzd-mfpt-cma-es-1-1 --top 20
+  biped-mfpt study export hzd-mfpt-cma-es-1-1 --output best.json
   biped-mfpt study front front-hzd front-smc --output front.png
 """,
         "output",

@@ -68,13 +68,14 @@ def shared_options() -> dict[str, Parser]:
     # Defaults of the model, and of all that the core checks itself, live in the core: an option
     # that is not given is None here and is not passed on.
     walker = group("walker", "walker")
-    walker.add_argument(
+    one_of = walker.add_mutually_exclusive_group()
+    one_of.add_argument(
         "--controller",
         default=DEFAULT_CONTROLLER,
         metavar="NAME",
         help="what walks, see `biped-mfpt controllers` (default: %(default)s)",
     )
-    walker.add_argument(
+    one_of.add_argument(
         "--controller-file",
         metavar="FILE",
         help="take it from a JSON file instead, as `biped-mfpt controllers NAME` prints it",
