@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from biped_mfpt_ros.arrays import numbers
 from biped_mfpt_ros.errors import InputError
 
 
@@ -338,11 +339,13 @@ class Given(Searcher):
 
     def __init__(self, bounds: np.ndarray, **settings: Any) -> None:
         super().__init__(bounds, **settings)
-        vectors = [np.asarray(v, dtype=np.float64) for v in self.candidates]
-        for i, vector in enumerate(vectors):
+        vectors, allowed = [], f"{self.n} finite numbers"
+        for i, candidate in enumerate(self.candidates):
+            vector = numbers(candidate, f"candidates[{i}]", allowed)
             if vector.shape != (self.n,) or not np.isfinite(vector).all():
-                raise InputError(f"candidates[{i}]", vector.tolist(), f"{self.n} finite numbers")
-        self._vectors = np.array(vectors)
+                raise InputError(f"candidates[{i}]", vector.tolist(), allowed)
+            vectors.append(vector)
+        self._vectors = np.array(vectors, dtype=np.float64)
 
     def _first(self) -> np.ndarray:
         return self._vectors

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from biped_mfpt_ros.arrays import numbers
 from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
@@ -206,10 +207,15 @@ class SearchSpace:
         Raises
         ------
         InputError
-            If there is no such controller: legs that never part, numbers that are not finite.
+            If there is no such controller: legs that never part, numbers that are not finite, or
+            another number of them.
         """
+        allowed = f"{len(self)} numbers"
+        vector = numbers(vector, "vector", allowed)
+        if vector.shape != (len(self),):
+            raise InputError("vector", f"shape {vector.shape}", allowed)
         values = self._origin.copy()
-        values[self._free] += np.asarray(vector) * self._scales[self._free]
+        values[self._free] += vector * self._scales[self._free]
         with np.errstate(all="ignore"):
             values[self._log] = np.exp(values[self._log])
             try:
@@ -219,8 +225,7 @@ class SearchSpace:
             except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
                 if isinstance(error, InputError):
                     raise
-                tried = np.asarray(vector).tolist()
-                raise InputError("vector", tried, f"a gait: {error}") from None
+                raise InputError("vector", vector.tolist(), f"a gait: {error}") from None
         made = Controller(name or f"{self._start.scheme}/trial", self._start.scheme, parameters)
         made.packed(self._robot)  # checks ranges
         return made

@@ -1,0 +1,42 @@
+"""Arrays that are none of numbers: an error that names the field, what was given, what may be."""
+
+import numpy as np
+import pytest
+
+from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.optimise.searchers import make_searcher
+from biped_mfpt_ros.optimise.space import SearchSpace
+from biped_mfpt_ros.walker.robot import rabbit
+
+NOT_NUMBERS = [
+    "abc",
+    ["a", "b"],
+    ["0.1", "0.2"],
+    None,
+    [None, 0.1],
+    [[0.1], [0.1, 0.2]],
+    [1j, 2.0],
+    {},
+    np.array(["2026-01-01"], dtype="datetime64[D]"),
+]
+SPACE = SearchSpace(controller("hzd/base"), rabbit())
+CHECKED = {
+    "vector": SPACE.controller,
+    "candidates[0]": lambda v: make_searcher("given", np.zeros((2, 2)), candidates=[v]),
+}
+
+
+@pytest.mark.parametrize("field", CHECKED)
+@pytest.mark.parametrize("value", NOT_NUMBERS, ids=repr)
+def test_what_is_no_array_of_numbers_is_refused(field, value):
+    with pytest.raises(InputError) as caught:
+        CHECKED[field](value)
+    assert caught.value.field == field
+    assert caught.value.value is value
+    assert "numbers" in caught.value.allowed
+
+
+def test_a_vector_of_another_length_is_refused():
+    with pytest.raises(InputError, match=r"vector: 'shape \(2,\)' is not allowed; allowed: \d+ nu"):
+        SPACE.controller([0.1, 0.2])
