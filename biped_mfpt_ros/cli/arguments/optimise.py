@@ -47,6 +47,7 @@ examples:
   biped-mfpt optimise --confirm front --mesh 0.25:0.03:inf:2000000 --seed 2
 """,
         "walker",
+        "terrain",
         "output",
     )
     optimise.add_argument(
@@ -106,16 +107,6 @@ examples:
         default=1.0,
         metavar="DEG",
         help="degrees, standard deviation of the slope (default: %(default)g)",
-    )
-    optimise.add_argument(
-        "--mean", type=number, default=0.0, metavar="DEG", help="degrees, mean slope (default: 0)"
-    )
-    optimise.add_argument(
-        "--correlation",
-        type=number,
-        default=0.0,
-        metavar="R",
-        help="of each slope with the one before (default: 0, independent slopes)",
     )
     optimise.add_argument(
         "--mesh",
