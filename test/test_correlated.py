@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_aggregation import exactly
+from test_gait import walked
 from test_markov import RELATIVE, assert_same_bits, method, relative
 
 from biped_mfpt_ros.chain.markov import (
@@ -26,7 +27,6 @@ from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
 from biped_mfpt_ros.gait.step import simulate_steps
-from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.terrain import deviations, slope_set
 
 both_methods = pytest.mark.usefixtures(method.__name__)
@@ -294,18 +294,11 @@ def test_a_walk_begins_after_flat_ground_and_follows_the_process(rho):
     result = monte_carlo(control, sigma, 5, 3, mu_s=mu, correlation=rho, state=start)
     assert result.steps.max() > 8  # beyond the slopes that are drawn first
     for n in range(5):
-        draws = np.random.Generator(np.random.PCG64([3, n])).standard_normal(500)
-        state, previous = start, 0.0
-        taken = 0
-        for e in draws:
-            taken += 1
-            slope = mu + rho * (previous - mu) + sigma * math.sqrt(1.0 - rho**2) * e
-            steps = simulate_steps(control, [state], [previous], [slope])
-            if steps.outcomes[0, 0] != Outcome.STEP:
-                break
-            state, previous = steps.next_states[0], slope
-        assert result.steps[n] == taken
-        assert result.outcomes[n] == steps.outcomes[0, 0]
+        slopes, slope = [], 0.0
+        for e in np.random.Generator(np.random.PCG64([3, n])).standard_normal(500):
+            slope = mu + rho * (slope - mu) + sigma * math.sqrt(1.0 - rho**2) * e
+            slopes.append(slope)
+        assert (result.steps[n], result.outcomes[n]) == walked(control, start, slopes)
 
 
 @pytest.fixture(scope="module")

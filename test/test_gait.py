@@ -122,21 +122,24 @@ def test_walks_depend_on_their_seed_alone():
     assert not np.array_equal(two.steps, other.steps)
 
 
+def walked(control, state, slopes):
+    """Steps to the fall, that one counted, and how it falls, from flat ground on some slopes."""
+    previous = 0.0
+    for taken, slope in enumerate(slopes, start=1):
+        steps = simulate_steps(control, [state], [previous], [slope])
+        if steps.outcomes[0, 0] != Outcome.STEP:
+            return taken, steps.outcomes[0, 0]
+        state, previous = steps.next_states[0], slope
+    return None
+
+
 def test_a_walk_is_the_step_map_again_and_again():
     control = controller("hzd/mfpt")
     result = monte_carlo(control, SIGMA, 5, 3)
+    start = find_limit_cycle(control).state
     for n in range(5):
         slopes = SIGMA * np.random.Generator(np.random.PCG64([3, n])).standard_normal(500)
-        state, previous = find_limit_cycle(control).state, 0.0
-        taken = 0
-        for slope in slopes:
-            taken += 1
-            steps = simulate_steps(control, [state], [previous], [slope])
-            if steps.outcomes[0, 0] != Outcome.STEP:
-                break
-            state, previous = steps.next_states[0], slope
-        assert result.steps[n] == taken
-        assert result.outcomes[n] == steps.outcomes[0, 0]
+        assert (result.steps[n], result.outcomes[n]) == walked(control, start, slopes)
 
 
 def test_first_step_is_dropped_as_in_table_2():
