@@ -75,13 +75,7 @@ class Recording:
                 scales=conversion.packed(mesh.scales, "d"),
             ),
         ]
-        self.states = []
-        for generation in range(int(mesh.generation.max()) + 1):
-            rows = np.flatnonzero(mesh.generation == generation)
-            rows = rows[rows > 0]
-            self.states += conversion.states_messages(
-                mesh_id, generation, int(rows[0]), mesh.states[rows], mesh.preceding[rows]
-            )
+        self.states = conversion.all_states_messages(mesh_id, mesh)
         self.transitions = [
             messages.MeshTransitions(
                 mesh_id=mesh_id,

@@ -544,13 +544,7 @@ class Publisher(Node):
             scales=packed(mesh.scales, "d"),
             message="" if status == MeshInfo.COMPLETE else "because",
         )
-        states = []
-        for generation in range(int(mesh.generation.max()) + 1):
-            of = np.flatnonzero(mesh.generation == generation)
-            of = of[of > 0]
-            states += messages.states_messages(
-                mesh_id, generation, int(of[0]), mesh.states[of], mesh.preceding[of]
-            )
+        states = messages.all_states_messages(mesh_id, mesh)
         rows = [*messages.transitions_messages(mesh_id, mesh.targets, mesh.outcomes)]
         for kind, topic in enumerate(([growing, closing], states, rows)):
             for sequence, message in enumerate(topic):

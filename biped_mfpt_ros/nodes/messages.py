@@ -391,6 +391,18 @@ def states_messages(
         )
 
 
+def all_states_messages(mesh_id: str, mesh: Mesh) -> list[msg.MeshStates]:
+    """States of a whole mesh but x_1, generation by generation, as they are published."""
+    out: list[msg.MeshStates] = []
+    for generation in range(int(mesh.generation.max()) + 1):
+        rows = np.flatnonzero(mesh.generation == generation)
+        rows = rows[rows > 0]
+        out += states_messages(
+            mesh_id, generation, int(rows[0]), mesh.states[rows], mesh.preceding[rows]
+        )
+    return out
+
+
 def transitions_messages(
     mesh_id: str, targets: np.ndarray, outcomes: np.ndarray
 ) -> Iterator[msg.MeshTransitions]:

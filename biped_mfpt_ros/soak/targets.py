@@ -189,13 +189,7 @@ class Published:
             )
             for status in (msg.MeshInfo.GROWING, msg.MeshInfo.COMPLETE)
         ]
-        states: list[Any] = []
-        for generation in range(int(mesh.generation.max()) + 1):
-            rows = np.flatnonzero(mesh.generation == generation)
-            rows = rows[rows > 0]
-            states += messages.states_messages(
-                mesh_id, generation, int(rows[0]), mesh.states[rows], mesh.preceding[rows]
-            )
+        states = messages.all_states_messages(mesh_id, mesh)
         transitions = [*messages.transitions_messages(mesh_id, mesh.targets, mesh.outcomes)]
         estimates = [
             messages.estimate_message(mesh_id, "hzd/base", mesh, 0.0, 0.05, 0.0, self.estimate, 0.1)
