@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from biped_mfpt_ros.chain.markov import solve_chain
+from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, MeshGrowth
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.optimise.searchers import make_searcher
 from biped_mfpt_ros.optimise.space import SearchSpace
 from biped_mfpt_ros.walker.robot import rabbit
+from biped_mfpt_ros.walker.terrain import check_slopes
 
 NOT_NUMBERS = [
     "abc",
@@ -21,7 +24,13 @@ NOT_NUMBERS = [
     np.array(["2026-01-01"], dtype="datetime64[D]"),
 ]
 SPACE = SearchSpace(controller("hzd/base"), rabbit())
+TARGETS, OUTCOMES = [[0, 0], [1, 0]], [[NOT_SIMULATED] * 2, [0, 1]]
 CHECKED = {
+    "slopes": check_slopes,
+    "initial_state": lambda v: MeshGrowth(v, [0.0], 0.1),
+    "targets": lambda v: solve_chain(v, OUTCOMES, [0.5, 0.5]),
+    "outcomes": lambda v: solve_chain(TARGETS, v, [0.5, 0.5]),
+    "probabilities": lambda v: solve_chain(TARGETS, OUTCOMES, v),
     "vector": SPACE.controller,
     "candidates[0]": lambda v: make_searcher("given", np.zeros((2, 2)), candidates=[v]),
 }

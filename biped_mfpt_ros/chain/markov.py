@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
+from biped_mfpt_ros.arrays import numbers
 from biped_mfpt_ros.chain import iteration
 from biped_mfpt_ros.chain.aggregation import ROUNDS, metastable_distribution, passage_times
 from biped_mfpt_ros.chain.lanes import LANES
@@ -172,9 +173,10 @@ def _check_chain(
     targets: ArrayLike, probabilities: ArrayLike, preceding: ArrayLike | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Targets, offsets (see `iteration`) and the probability of each class."""
-    shape = np.shape(targets)
+    allowed = "an array of numbers of shape (n, m), n at least 2, m at least 1"
+    shape = numbers(targets, "targets", allowed).shape
     if len(shape) != 2 or shape[0] < 2 or shape[1] < 1:
-        raise InputError("targets", shape, "an array of shape (n, m), n at least 2, m at least 1")
+        raise InputError("targets", shape, allowed)
     targets = checked_array("targets", targets, np.uint32, shape)
     if targets.max() >= shape[0]:
         raise InputError("targets", int(targets.max()), f"indices of states, below {shape[0]}")

@@ -36,6 +36,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
+from biped_mfpt_ros.arrays import numbers
 from biped_mfpt_ros.chain.nearest import STATE_SIZE, StateSet
 from biped_mfpt_ros.chain.refresh import additions
 from biped_mfpt_ros.errors import InputError
@@ -160,12 +161,9 @@ def checked_array(
     InputError
         If one of these does not hold.
     """
-    try:
-        given = np.asarray(value)
-        with np.errstate(invalid="ignore"):
-            out = np.ascontiguousarray(given, dtype=dtype).reshape(given.shape)
-    except (TypeError, ValueError):
-        raise InputError(field, value, f"an array of numbers of shape {shape}") from None
+    given = numbers(value, field, f"an array of numbers of shape {shape}")
+    with np.errstate(invalid="ignore"):
+        out = np.ascontiguousarray(given, dtype=dtype).reshape(given.shape)
     if given.shape != shape:
         raise InputError(field, given.shape, f"an array of shape {shape}")
     if given.dtype == out.dtype:

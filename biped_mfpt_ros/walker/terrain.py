@@ -8,6 +8,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
+from biped_mfpt_ros.arrays import numbers
 from biped_mfpt_ros.errors import InputError
 
 SLOPE_LIMIT_DEG = 45.0
@@ -61,9 +62,10 @@ def check_slopes(slopes: ArrayLike, field: str = "slopes") -> np.ndarray:
     InputError
         If one of these does not hold.
     """
-    out = np.ascontiguousarray(slopes, dtype=np.float64)
+    allowed = "numbers: a list of at least one slope, shape (m,)"
+    out = np.ascontiguousarray(numbers(slopes, field, allowed), dtype=np.float64)
     if out.ndim != 1 or out.size == 0:
-        raise InputError(field, out.shape, "a list of at least one slope, shape (m,)")
+        raise InputError(field, out.shape, allowed)
     outside = ~(np.abs(out) <= SLOPE_LIMIT)
     if outside.any():
         raise InputError(
