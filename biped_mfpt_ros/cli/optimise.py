@@ -105,6 +105,9 @@ def _locally(study: Study, workers: int, args: argparse.Namespace, tally: _Tally
 def _over_ros(
     study: Study, workers: int, args: argparse.Namespace, tally: _Tally, progress: Progress
 ) -> str:
+    if study.settings.searcher == "cma-es":
+        import cmaes  # noqa: F401 - later it would take a second, in which feedback got lost
+
     from biped_mfpt_ros.cli.optimise_pipeline import run_study
 
     def on_trial(trial: Any) -> None:
