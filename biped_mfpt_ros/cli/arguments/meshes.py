@@ -133,13 +133,13 @@ The bag alone holds all that is needed: nothing is simulated, and the numbers eq
 run bit for bit.
 
 examples:
-  biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag
-  biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag --sigma 0.5 1 1.5 2 --mean -1 --json
-  biped-mfpt inspect runs/20250131-120000-hzd-mfpt/bag --repair saved
+  biped-mfpt inspect runs/20250131-120000-hzd-mfpt
+  biped-mfpt inspect runs/20250131-120000-hzd-mfpt --sigma 0.5 1 1.5 2 --mean -1 --json
+  biped-mfpt inspect runs/20250131-120000-hzd-mfpt --repair saved
 """,
         "output",
     )
-    inspect.add_argument("bag", metavar="BAG", help="directory of a bag, or its .mcap file")
+    inspect.add_argument("bag", metavar="BAG", help="directory of a run or a bag, or an .mcap file")
     inspect.add_argument(
         "--sigma",
         type=number,
