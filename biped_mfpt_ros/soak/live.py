@@ -68,7 +68,9 @@ _START = 300.0  # s, for nodes that may have to compile
 _FACTS = re.compile(
     r"no limit cycle of|the mesh would hold more than max_states|sigma_s\[\d+\]: (the|a) chain"
 )
-_REFUSAL = re.compile(r"(?:.*?: )??(\S[^:]*): (.*) is not allowed; allowed: (.+)", re.DOTALL)
+_REFUSAL = re.compile(
+    r"(?:.*?: )??(\S[^:]*): (?:(.*) is not allowed|missing); allowed: (.+)", re.DOTALL
+)
 # Of rclpy, before the node is asked.
 _OUT_OF_RANGE = re.compile(r"Parameter \S+ out of range\.? Min: .+, Max: .+, value: ")
 
