@@ -161,6 +161,8 @@ class TestInProcess:
         # 27 steps after the first ones: (1 - 1 / 9.0)^27 is about 5 %.
         assert text.startswith("hzd/mfpt: no fall; 95 % confidence: more than 9.0128 steps")
         assert "3 stopped after 10 steps" in text
+        assert main([*arguments[:-3], "80", "--walks", "3"]) == 0
+        assert "hzd/mfpt: all walks fell in the first step" in capsys.readouterr().out
 
     @pytest.mark.parametrize(
         ("arguments", "note"),

@@ -136,7 +136,9 @@ def monte_carlo(args: argparse.Namespace) -> None:
     low, high = result.confidence_interval
     confidence = f", 95 % confidence {number(low)} to {number(high)}" if result.falls > 1 else ""
     mean_steps = f"{number(result.mean_steps)} steps to a fall on average"
-    if result.counted.size and not result.falls:
+    if not result.counted.size:
+        mean_steps = "all walks fell in the first step, which does not count"
+    elif not result.falls:
         # Of a constant chance of falling p: (1 - p)^n = 5 % for n steps without a fall.
         least = result.counted.sum() / -math.log(0.05)
         mean_steps = f"no fall; 95 % confidence: more than {number(float(least))} steps to a fall"
