@@ -208,14 +208,18 @@ def test_a_study_that_was_killed_goes_on(tmp_path, number):
     # Without an end, so that it is not done before it is stopped.
     command = [sys.executable, "-m", "biped_mfpt_ros.cli", "optimise", *QUICK,
                "--store", str(path), "--study", "s"]  # fmt: skip
-    process = subprocess.Popen(command, env=dict(os.environ))
+    command.remove("--quiet")
+    process = subprocess.Popen(
+        command, env=dict(os.environ), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + PATIENCE
     while not path.exists() or len(outline_so_far(path)) < 8:
         assert time.monotonic() < deadline
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(number)
-    process.wait()
+    _, told = process.communicate()
+    assert ("the same command goes on with study s" in told) == (number == signal.SIGTERM)
     before = outline(path)
     trials = ("--trials", str(max(60, len(before) + 20)))
     assert optimise(path, *trials) == 0

@@ -58,11 +58,15 @@ def optimise(args: argparse.Namespace) -> None:
             f"study {name} in {args.store}: {plural(len(study.space), 'free parameter')}, "
             f"{plural(len(tally.before), 'trial')} so far"
         )
-        if args.local:
-            ended = _locally(study, workers, args, tally)
-        else:
-            compile_all(progress.say)
-            ended = _over_ros(study, workers, args, tally, progress)
+        try:
+            if args.local:
+                ended = _locally(study, workers, args, tally)
+            else:
+                compile_all(progress.say)
+                ended = _over_ros(study, workers, args, tally, progress)
+        except KeyboardInterrupt:
+            progress.say(f"stopped; the same command goes on with study {name}")
+            raise
     study.close()
     trials = study.trials()
     result = {

@@ -20,7 +20,7 @@ def study(args: argparse.Namespace) -> None:
     """List, show, plot or export studies."""
     path = Path(args.store)
     if not path.exists():
-        raise InputError("--store", args.store, "a file that `biped-mfpt optimise` wrote")
+        raise InputError("--store", args.store, "a file that `biped-mfpt optimise` made")
     if args.output is not None and Path(args.output).exists():
         raise InputError("--output", args.output, "a file that does not exist yet")
     store = Store(path)

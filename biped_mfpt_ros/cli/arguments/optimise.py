@@ -156,7 +156,10 @@ examples:
         "3000 trials)",
     )
     optimise.add_argument(
-        "--trials", type=whole, metavar="N", help="stop when the study has N trials"
+        "--trials",
+        type=whole,
+        metavar="N",
+        help="stop when the study has N trials (default: when it is stopped)",
     )
     optimise.add_argument(
         "--seconds", type=number, metavar="S", help="s, begin no trial after that"
