@@ -189,8 +189,9 @@ def _share_out(
     if source is None:
         start = np.unique(groups[among])
         y = limit_distribution(c, c_falls, start, tolerance)
-        if y is not None and y[start].max() < UNDERFLOW:
+        if y is not None and y[start].max() < UNDERFLOW and count < len(x):
             # Another class seems to outlive that of `among`, as long as its shape is not known.
+            # Where it is, states to a group one each, both do for as long but for rounding.
             return x
     else:
         # Not by BLAS, whose order of operations depends on the machine.
