@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -132,22 +135,28 @@ def test_sliding_mode_leaves_the_law_of_the_paper(name, switched):
     assert compared > 200
 
 
-def law(sigma, rate, k, exponent, width):
-    return smc._law(sigma, rate, smc._distance(rate, k, exponent), k, exponent, width)
+def one_law(k, exponent, tau=0.1):
+    """Packed parameters with the same law for every output, of which the first is looked at."""
+    values = [0.0] * 6 + [k] * 4 + [0.5 * (exponent + 1.0)] * 4 + [tau] * 4
+    return smc.packed(np.array(values), rabbit())
+
+
+def law(par, sigma, rate):
+    return smc._law(par, 0, sigma, rate, smc._slow(par, 0, rate))
 
 
 def test_sliding_mode_near_sigma_zero_rests_on_its_slow_manifold():
     """There v = -dh / tau, so that sigma stays; and the law is odd and finite everywhere."""
     k = 50.0
     for exponent in (0.4, 0.2, -0.03):
-        width = (k / smc.STEEPEST) ** (1 / (1 - exponent))
+        par = one_law(k, exponent)
         for rate in (0.0, 1e-3, 0.5, 5.0):
             slow = (rate / k) ** (1 / exponent) if exponent > 0 else rate / smc.STEEPEST
-            assert law(slow, rate, k, exponent, width) == pytest.approx(rate, abs=1e-9)
+            assert law(par, slow, rate) == pytest.approx(rate, abs=1e-9)
             for sigma in (0.0, 1e-12, 1e-6, 1e-3, 0.1, 3.0):
-                value = law(sigma, rate, k, exponent, width)
+                value = law(par, sigma, rate)
                 assert math.isfinite(value)
-                assert law(-sigma, -rate, k, exponent, width) == -value
+                assert law(par, -sigma, -rate) == -value
 
 
 @pytest.mark.parametrize("exponent", [0.4, 0.2])
@@ -157,7 +166,7 @@ def test_an_output_that_slides_settles_as_the_law_of_the_paper_has_it(exponent):
     To 3e-6 rad and 3e-5 rad/s: what the bounds on the law's slope may change while it is reached.
     """
     k, tau = 50.0, 0.1
-    width = (k / smc.STEEPEST) ** (1 / (1 - exponent))
+    par = one_law(k, exponent, tau)
     start, end = np.array([0.15, 0.0]), 0.4
 
     def literal(t, y):
@@ -165,16 +174,16 @@ def test_an_output_that_slides_settles_as_the_law_of_the_paper_has_it(exponent):
         return [y[1], -k * abs(sigma) ** exponent * np.sign(sigma)]
 
     def reaching(t, y):
-        return [y[1], -law(y[1] + y[0] / tau, y[1] / tau, k, exponent, width)]
+        return [y[1], -law(par, y[1] + y[0] / tau, y[1] / tau)]
 
     def sliding(t, y):
         rate = y[1] / tau
-        distance = smc._distance(rate, k, exponent)
-        return [y[1], -smc._sliding(y[1] + y[0] / tau, rate, distance, 1 / tau, exponent)]
+        slow = smc._slow(par, 0, rate)
+        return [y[1], -smc._sliding(par, 0, y[1] + y[0] / tau, rate, slow)]
 
     def arrived(t, y):
         rate = y[1] / tau
-        slope = smc._slope(rate, smc._distance(rate, k, exponent), exponent)
+        slope = smc._slope(par, 0, rate, smc._slow(par, 0, rate))
         off = abs(reaching(t, y)[1] + rate) / smc.SLIDING_RATE
         return max(off / smc.ENTRY, slope * smc.STIFF) - 1.0
 
@@ -315,3 +324,35 @@ def test_torques_are_cut_off_joint_by_joint():
 def test_parameters_that_are_not_allowed_are_named(build, field):
     with pytest.raises(InputError, match=rf"^{field}: "):
         build()
+
+
+_PACKED = """
+from biped_mfpt_ros.control.controller import controller, controller_names
+from biped_mfpt_ros.walker.robot import WalkerModel
+model = WalkerModel()
+print(model.packed().tobytes().hex())
+for name in controller_names():
+    print(controller(name).packed(model.robot).tobytes().hex())
+"""
+
+
+def test_kernels_read_the_same_bits_on_other_processors():
+    """Simulators of one mesh may run on several; BLAS, numpy and the C library look which."""
+    features = "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+    older = {
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "NPY_DISABLE_CPU_FEATURES": features,
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4",
+    }
+    here, there = (
+        subprocess.run(
+            [sys.executable, "-c", _PACKED],
+            env={**os.environ, **environment},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout.splitlines()
+        for environment in ({}, older)
+    )
+    assert len(here) == 1 + len(controller_names())
+    assert here == there

@@ -182,6 +182,16 @@ def test_sine_and_cosine_to_3e_15():
     assert np.isnan(dynamics.sine_cosine(math.nan)).all()
 
 
+def test_direction_is_that_of_the_c_library():
+    angles = np.linspace(-math.pi, math.pi, 721)
+    for length in (1e-3, 1.0, 1e3):
+        x, y = length * np.cos(angles), length * np.sin(angles)
+        found = np.array([dynamics.direction(*point) for point in zip(x, y, strict=True)])
+        wanted = [math.atan2(*point) for point in zip(y, x, strict=True)]
+        # What sines are good for, and a rounding of numbers up to 3.2.
+        assert np.abs(found - wanted).max() <= 4e-15
+
+
 def test_slope_set_of_the_paper():
     slopes = slope_set(0.5)
     assert slopes.size == 81

@@ -13,8 +13,9 @@ import numpy as np
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
+from biped_mfpt_ros.walker.dynamics import direction, sine_cosine
 from biped_mfpt_ros.walker.impact import impact_map
-from biped_mfpt_ros.walker.robot import ABSOLUTE, Robot, rabbit
+from biped_mfpt_ros.walker.robot import ABSOLUTE, Robot, rabbit, weighted_sum
 
 DEGREE = 6
 """M of eq. (12)."""
@@ -105,11 +106,10 @@ def double_support(joints: np.ndarray, robot: Robot) -> np.ndarray:
         of the stance foot.
     """
     q = np.append(joints, 0.0)
-    a = ABSOLUTE @ q
+    s, c = np.array([sine_cosine(angle) for angle in weighted_sum(q, ABSOLUTE.T)]).T
     foot = robot.swing_foot_position
-    x, y = -foot @ np.sin(a), foot @ np.cos(a)
     # Turning the whole robot by -phi brings a foot that stands at angle phi to angle zero.
-    q[4] = -math.atan2(y, x)
+    q[4] = -direction(-weighted_sum(foot, s), weighted_sum(foot, c))
     return q
 
 
@@ -224,7 +224,7 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     out[_SLOPE] = 1.0 / (end - start)
     out[_OFF] = parameters[-1] if parameters.size > len(PARAMETERS) else math.inf
     with np.errstate(over="ignore", invalid="ignore"):
-        monomials = bezier @ _bernstein_to_monomial()
+        monomials = weighted_sum(bezier.T[:, :, None], _bernstein_to_monomial())
     if not np.isfinite(monomials).all():
         raise InputError("parameters[alpha]", bezier.tolist(), "numbers whose sums are finite")
     out[_MONOMIAL:] = monomials.ravel()

@@ -34,7 +34,7 @@ import numpy as np
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
-from biped_mfpt_ros.lanes import binary_exponent, mantissa, power_of_two, select
+from biped_mfpt_ros.lanes import any_lane, binary_exponent, mantissa, power_of_two, select
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot
 
@@ -80,9 +80,11 @@ STIFF = 1000.0
 """1/s: an output slides where the law about its slow manifold is at least so steep."""
 
 # Offsets into the packed parameters: references before and after the switch, then k, 2 alpha - 1,
-# 1 / tau, and the half width about sigma = 0 where the law is linear.
+# 1 / tau, and the half width about sigma = 0 where the law is linear; and what is computed of those
+# once: 1 / k, 1 / (2 alpha - 1) or 0, the width's fourth power, and (alpha - 1) / 2.
 _REF1, _REF2, _K, _EXPONENT, _RATE, _WIDTH = 0, 4, 8, 12, 16, 20
-PACKED_SIZE = 24
+_PER_K, _PER_EXPONENT, _WIDTH_4, _POWER_4 = 24, 28, 32, 36
+PACKED_SIZE = 40
 
 _ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to an integer
 _SQRT_HALF = math.sqrt(0.5)
@@ -125,16 +127,20 @@ def power(x, p):
     e = select(low, e - 1.0, e)
     t = (m - 1.0) / (m + 1.0)
     z = t * t
-    series = _LOG[6] * z + _LOG[5]
-    for i in range(4, -1, -1):
-        series = series * z + _LOG[i]
+    zz = z * z
+    series = (_LOG[0] + _LOG[1] * z) + zz * (
+        (_LOG[2] + _LOG[3] * z) + zz * ((_LOG[4] + _LOG[5] * z) + zz * _LOG[6])
+    )
     y = p * (e + t * series)
-    y = select(y < -1000.0, -1000.0, select(y > 1000.0, 1000.0, y))
+    y = select(y < -1000.0, -1000.0, y)
+    y = select(y > 1000.0, 1000.0, y)
     n = (y + _ROUND) - _ROUND
     f = y - n
-    series = _EXP[10] * f + _EXP[9]
-    for i in range(8, -1, -1):
-        series = series * f + _EXP[i]
+    ff = f * f
+    f4 = ff * ff
+    low = (_EXP[0] + _EXP[1] * f) + ff * (_EXP[2] + _EXP[3] * f)
+    high = (_EXP[4] + _EXP[5] * f) + ff * (_EXP[6] + _EXP[7] * f)
+    series = low + f4 * (high + f4 * ((_EXP[8] + _EXP[9] * f) + ff * _EXP[10]))
     return series * power_of_two(n)
 
 
@@ -151,74 +157,73 @@ def _sigma(par, i, switched, value, rate):
 
 
 @inlined_kernel
-def _distance(rate, k, exponent):
-    """``|sigma|`` on the slow manifold of eq. (21) to first order, where the law is ``rate``."""
-    if exponent > 0.0:
-        return power(abs(rate) / k, 1.0 / exponent)
-    return 0.0 * rate
+def _slow(par, i, rate):
+    """``sigma`` on the slow manifold of eq. (21) to first order, where the law is ``rate``."""
+    if par[_EXPONENT + i] > 0.0:
+        return _with_sign(power(abs(rate) * par[_PER_K + i], par[_PER_EXPONENT + i]), rate)
+    return rate * (1.0 / STEEPEST)
 
 
 @inlined_kernel
-def _slow(rate, distance, exponent, width):
-    """Where the law is about ``rate``, and whether there is such a sigma."""
-    size = abs(rate)
-    if exponent > 0.0:
-        return _with_sign(distance, rate), size == size
+def _slides(par, i, rate):
+    """Whether there is such a sigma."""
+    if par[_EXPONENT + i] > 0.0:
+        return rate == rate
     # Faster than the law ever is, it does not slide: sigma = 0 is only crossed.
-    return rate / STEEPEST, size <= STEEPEST * width
+    return abs(rate) <= STEEPEST * par[_WIDTH + i]
 
 
 @inlined_kernel
-def _slope(rate, distance, exponent):
+def _slope(par, i, rate, slow):
     """Slope of the slow manifold over ``rate``, s."""
-    size = abs(rate)
-    if exponent > 0.0:
-        return select(size > 1e-12, distance / (exponent * size), 0.0)
+    if par[_EXPONENT + i] > 0.0:
+        return select(abs(rate) > 1e-12, par[_PER_EXPONENT + i] * slow / rate, 0.0)
     return 0.0 * rate
 
 
 @inlined_kernel
-def _law(sigma, rate, distance, k, exponent, width):
-    """-v of eq. (21) for one output; ``rate`` is dh / tau, ``distance`` as of `_distance`.
+def _law(par, i, sigma, rate, slow):
+    """-v of eq. (21) for one output; ``rate`` is dh / tau, ``slow`` as of `_slow`.
 
     ``|sigma|`` is smoothed to ``(sigma^4 + width^4)^(1/4)``, so that the law is linear far below
     the width, and eq. (21) to a few parts of 1e9 at a hundred widths.
     """
-    size = sigma * sigma
-    size = size * size + width * width * width * width
-    law = k * sigma * power(size, 0.25 * (exponent - 1.0))
-    slow, slides = _slow(rate, distance, exponent, width)
+    square = sigma * sigma
+    size = square * square + par[_WIDTH_4 + i]
+    law = par[_K + i] * sigma * power(size, par[_POWER_4 + i])
     excess = law - rate
     bound = SLIDING_RATE * abs(sigma - slow)
-    bounded = (abs(excess) > bound) & slides
+    bounded = (abs(excess) > bound) & _slides(par, i, rate)
     return select(bounded, rate + _with_sign(bound, excess), law)
 
 
 @inlined_kernel
-def _sliding(sigma, rate, distance, inverse_tau, exponent):
+def _sliding(par, i, sigma, rate, slow):
     """-v of an output that slides.
 
     On the slow manifold ``sigma = S(rate)``, where ``-v = rate - dS/dt`` and
     ``d(rate)/dt = v / tau``. To second order in ``g = S' / tau``, of which S itself differs by a
     factor from where the law is ``rate``.
     """
-    slow = _with_sign(distance, rate)
-    g = _slope(rate, distance, exponent) * inverse_tau
-    if exponent > 0.0:
-        slow = slow * (1.0 + g / exponent)
-        g = g * (1.0 + (2.0 / exponent - 1.0) * g)
+    g = _slope(par, i, rate, slow) * par[_RATE + i]
+    if par[_EXPONENT + i] > 0.0:
+        per_exponent = par[_PER_EXPONENT + i]
+        slow = slow * (1.0 + g * per_exponent)
+        g = g * (1.0 + (2.0 * per_exponent - 1.0) * g)
+    else:
+        slow = 0.0 * rate
     return rate / (1.0 - g) + DRIFT * (sigma - slow)
 
 
 @inlined_kernel
 def _output(par, i, switched, slides, value, rate):
     """Acceleration of one output (eq. 18, 21); ``switched`` and ``slides`` are 0 or 1."""
-    k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
     sigma, slow_rate = _sigma(par, i, switched, value, rate)
-    distance = _distance(slow_rate, k, exponent)
-    law = _law(sigma, slow_rate, distance, k, exponent, width)
-    along = _sliding(sigma, slow_rate, distance, par[_RATE + i], exponent)
-    return -select(slides > 0.5, along, law)
+    slow = _slow(par, i, slow_rate)
+    law = _law(par, i, sigma, slow_rate, slow)
+    if any_lane(slides > 0.5):
+        law = select(slides > 0.5, _sliding(par, i, sigma, slow_rate, slow), law)
+    return -law
 
 
 @inlined_kernel
@@ -249,16 +254,14 @@ def off_slide(par, i, a, da, switched):
         value, rate = a[3] - a[1], da[3] - da[1]
     elif i == 3:
         value, rate = a[4], da[4]
-    k, exponent, width = par[_K + i], par[_EXPONENT + i], par[_WIDTH + i]
     sigma, slow_rate = _sigma(par, i, switched, value, rate)
-    distance = _distance(slow_rate, k, exponent)
-    slope = _slope(slow_rate, distance, exponent)
-    g = slope * par[_RATE + i] / exponent if exponent > 0.0 else 0.0 * slope
-    _, slides = _slow(slow_rate, distance, exponent, width)
-    law = _law(sigma, slow_rate, distance, k, exponent, width)
+    slow = _slow(par, i, slow_rate)
+    slope = _slope(par, i, slow_rate, slow)
+    g = slope * par[_RATE + i] * par[_PER_EXPONENT + i]
+    law = _law(par, i, sigma, slow_rate, slow)
     off = abs(law - slow_rate) / (SLIDING_RATE * ENTRY + 2.0 * g * abs(slow_rate))
     stiff = slope * STIFF
-    return select(slides, select(stiff > off, stiff, off) - 1.0, math.inf)
+    return select(_slides(par, i, slow_rate), select(stiff > off, stiff, off) - 1.0, math.inf)
 
 
 @inner_kernel
@@ -326,15 +329,14 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     ref1, ref2, q3, q4_1, q4_2, torso = parameters[:6]
     out[_REF1 : _REF1 + 4] = ref1, q3, q4_1, torso
     out[_REF2 : _REF2 + 4] = ref2, q3, q4_2, torso
-    out[_K : _K + 4] = parameters[6:10]
-    exponent = 2.0 * parameters[10:14] - 1.0
-    out[_EXPONENT : _EXPONENT + 4] = exponent
-    # Where k w^exponent = STEEPEST w; a plain PD law (exponent 1) needs no such range.
-    out[_WIDTH : _WIDTH + 4] = 0.0
-    bent = exponent < 1.0
-    with np.errstate(over="ignore"):  # an infinite range is one where the law is linear throughout
-        out[_WIDTH : _WIDTH + 4][bent] = (parameters[6:10] / STEEPEST)[bent] ** (
-            1.0 / (1.0 - exponent[bent])
-        )
-    out[_RATE : _RATE + 4] = 1.0 / parameters[14:18]
+    for i in range(4):
+        k, exponent = float(parameters[6 + i]), 2.0 * float(parameters[10 + i]) - 1.0
+        # Where k w^exponent = STEEPEST w; a plain PD law (exponent 1) needs no such range.
+        width = power(k / STEEPEST, 1.0 / (1.0 - exponent)) if exponent < 1.0 else 0.0
+        out[_K + i], out[_EXPONENT + i], out[_WIDTH + i] = k, exponent, width
+        out[_RATE + i] = 1.0 / parameters[14 + i]
+        out[_PER_K + i] = 1.0 / k
+        out[_PER_EXPONENT + i] = 1.0 / exponent if exponent > 0.0 else 0.0
+        out[_WIDTH_4 + i] = (width * width) * (width * width)
+        out[_POWER_4 + i] = 0.25 * (exponent - 1.0)
     return out

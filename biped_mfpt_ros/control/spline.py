@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import inner_kernel
 from biped_mfpt_ros.walker.impact import impact_map
-from biped_mfpt_ros.walker.robot import Robot
+from biped_mfpt_ros.walker.robot import Robot, weighted_sum
 
 COEFFICIENTS = 8
 """Of each output's reference."""
@@ -203,4 +203,5 @@ def _polynomials(parameters: np.ndarray) -> np.ndarray:
     """Polynomials of the references, piece by piece, shape (_PIECES, 4, 4): output, power."""
     table = parameters[_TABLE:].reshape(4, COEFFICIENTS)
     window = np.arange(_PIECES)[:, None] + np.arange(-2, 2)
-    return np.einsum("ipk,kn->pin", table[:, np.clip(window, 0, COEFFICIENTS - 1)], _BASIS)
+    coefficients = table.T[np.clip(window.T, 0, COEFFICIENTS - 1)]
+    return weighted_sum(coefficients[:, :, :, None], _BASIS)

@@ -60,6 +60,24 @@ def sine_cosine(angle):
 
 
 @inner_kernel
+def direction(x, y):
+    """Angle of the vector (x, y) from the first axis, rad, -pi to pi.
+
+    The same bits on every machine, unlike the C library's: by Newton's method on `sine_cosine`.
+    """
+    angle = 0.0
+    if abs(y) > abs(x):
+        angle = 0.5 * math.pi if y > 0.0 else -0.5 * math.pi
+    elif x < 0.0:
+        angle = math.pi if y >= 0.0 else -math.pi
+    # At most 45 degrees are left. An error e becomes e^3 / 3 or less: 0.22, 4e-3, 2e-8, rounding.
+    for _ in range(5):
+        s, c = sine_cosine(angle)
+        angle += (y * c - x * s) / (x * c + y * s)
+    return angle
+
+
+@inner_kernel
 def sines(a):
     """Sines and cosines of five angles."""
     s0, c0 = sine_cosine(a[0])

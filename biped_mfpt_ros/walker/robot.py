@@ -167,6 +167,23 @@ class Robot:
         return np.array([-femur, femur, -tibia, tibia, 0.0])
 
 
+def weighted_sum(weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """``sum_k weights[k] rows[k]``, in the same order of operations on every machine.
+
+    BLAS and `numpy.einsum` choose the order, and whether to round products, by the processor. What
+    the kernels read must not differ between the machines that share the steps of a mesh.
+
+    Parameters
+    ----------
+    weights, rows : numpy.ndarray
+        First axis alike; the others are broadcast.
+    """
+    total = weights[0] * rows[0]
+    for weight, row in zip(weights[1:], rows[1:], strict=True):
+        total = total + weight * row
+    return total
+
+
 @cache
 def rabbit() -> Robot:
     """RABBIT, with the constants of ``data/rabbit.json``."""
@@ -245,9 +262,10 @@ class WalkerModel:
         robot = self.robot
         masses, position = robot.link_masses, robot.link_positions
         out = np.empty(PACKED_SIZE)
-        out[C : C + 25] = np.einsum("k,ki,kj->ij", masses, position, position).ravel()
+        coupling = weighted_sum(masses, position[:, :, None] * position[:, None, :])
+        out[C : C + 25] = coupling.ravel()
         out[I_LINK : I_LINK + 5] = robot.link_inertias
-        out[W : W + 5] = masses @ position
+        out[W : W + 5] = weighted_sum(masses, position)
         out[MASS] = robot.mass
         out[GRAVITY] = robot.gravity
         out[FEMUR] = robot.femur_length
