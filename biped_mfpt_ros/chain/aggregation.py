@@ -189,9 +189,8 @@ def _share_out(
     if source is None:
         start = np.unique(groups[among])
         y = limit_distribution(c, c_falls, start, tolerance)
-        if y is not None and y[start].max() < UNDERFLOW and count < len(x):
+        if y is not None and y[start].max() < UNDERFLOW:
             # Another class seems to outlive that of `among`, as long as its shape is not known.
-            # Where it is, states to a group one each, both do for as long but for rounding.
             return x
     else:
         # Not by BLAS, whose order of operations depends on the machine.
@@ -247,6 +246,9 @@ def _balanced(
     """
     n = len(falls)
     if n <= GROUPS:
+        if among is not None:
+            # What seems to outlive `among` here lasts as long, but for rounding.
+            return limit_distribution(q.toarray(), falls, among, tolerance)
         return _share_out(q, falls, np.ones(n), np.arange(n), tolerance, among, source)
     backward, pieces = csr_array(q.T), _pieces(q)
     x = _step(backward, np.full(n, 1.0 / n) if begin is None else begin, source, _STEPS)
