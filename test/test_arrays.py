@@ -5,8 +5,9 @@ import pytest
 
 from biped_mfpt_ros.chain.markov import solve_chain
 from biped_mfpt_ros.chain.mesh import NOT_SIMULATED, MeshGrowth
-from biped_mfpt_ros.control.controller import controller
+from biped_mfpt_ros.control.controller import Controller, controller
 from biped_mfpt_ros.errors import InputError
+from biped_mfpt_ros.gait.step import check_state, check_states, simulate_steps
 from biped_mfpt_ros.optimise.searchers import make_searcher
 from biped_mfpt_ros.optimise.space import SearchSpace
 from biped_mfpt_ros.walker.robot import rabbit
@@ -23,9 +24,14 @@ NOT_NUMBERS = [
     {},
     np.array(["2026-01-01"], dtype="datetime64[D]"),
 ]
-SPACE = SearchSpace(controller("hzd/base"), rabbit())
+BASE = controller("hzd/base")
+SPACE = SearchSpace(BASE, rabbit())
 TARGETS, OUTCOMES = [[0, 0], [1, 0]], [[NOT_SIMULATED] * 2, [0, 1]]
 CHECKED = {
+    "states": check_states,
+    "previous_slopes": lambda v: simulate_steps(BASE, np.zeros((1, 10)), v, [0.0]),
+    "parameters": lambda v: Controller("mine", "hzd", v),
+    "state": check_state,
     "slopes": check_slopes,
     "initial_state": lambda v: MeshGrowth(v, [0.0], 0.1),
     "targets": lambda v: solve_chain(v, OUTCOMES, [0.5, 0.5]),

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from biped_mfpt_ros.arrays import numbers
 from biped_mfpt_ros.control import hzd, smc, spline
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.walker.robot import Robot
@@ -81,13 +82,12 @@ class Controller:
         if self.scheme not in SCHEMES:
             raise InputError("scheme", self.scheme, "one of " + ", ".join(SCHEMES))
         scheme = SCHEMES[self.scheme]
-        values = np.array(self.parameters, dtype=np.float64)
         least, most = len(scheme.parameters), len(scheme.parameters) + scheme.optional
+        lengths = f"{least}" if least == most else f"{least} to {most}"
+        allowed = f"{lengths} numbers for scheme {self.scheme}"
+        values = np.array(numbers(self.parameters, "parameters", allowed), dtype=np.float64)
         if values.ndim != 1 or not least <= values.size <= most:
-            lengths = f"{least}" if least == most else f"{least} to {most}"
-            raise InputError(
-                "parameters", f"length {values.size}", f"{lengths} numbers for scheme {self.scheme}"
-            )
+            raise InputError("parameters", f"length {values.size}", allowed)
         # Only the optional ones may be infinite: they are limits.
         bad = np.isnan(values) | (np.isinf(values) & (np.arange(values.size) < least))
         if bad.any():

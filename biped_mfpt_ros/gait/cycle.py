@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
-from biped_mfpt_ros.gait.step import Steps, check_states, simulate_steps
+from biped_mfpt_ros.gait.step import Steps, check_state, simulate_steps
 from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.robot import STATE_SIZE, Robot, WalkerModel
 from biped_mfpt_ros.walker.terrain import SLOPE_LIMIT
@@ -157,7 +157,7 @@ def find_limit_cycle(
     if guess is None:
         states = np.array([controller.reference_state(r, model.robot) for r in _START_RATES])
     else:
-        states = check_states(np.atleast_2d(np.asarray(guess, dtype=np.float64)), "guess")
+        states = check_state(guess, "guess")[np.newaxis]
     search = _Search(controller, slope, model)
     falls: np.ndarray = np.empty(0, dtype=np.uint8)
     unstable: LimitCycle | None = None

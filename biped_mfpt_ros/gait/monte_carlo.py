@@ -211,7 +211,7 @@ def monte_carlo(
         raise InputError("seed", seed, ">= 0")
     if state is None:
         state = find_limit_cycle(controller, 0.0, model).state
-    start = step.check_states(np.asarray(state, dtype=np.float64)[None], "state")[0]
+    start = step.check_state(state)
 
     packed_model, packed_controller = model.packed(), controller.packed(model.robot)
     states = np.tile(start, (walks, 1))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from biped_mfpt_ros.arrays import numbers
 from biped_mfpt_ros.control.controller import Controller
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.ground import slopes_ahead, to_joint
@@ -162,14 +163,21 @@ class Steps:
 
 def check_states(states: ArrayLike, field: str = "states") -> np.ndarray:
     """Check states: shape (n, 10), finite; returned as contiguous float64, or InputError."""
-    out = np.ascontiguousarray(states, dtype=np.float64)
+    allowed = f"numbers, shape (n, {STATE_SIZE}): q1..q5, dq1..dq5"
+    out = np.ascontiguousarray(numbers(states, field, allowed), dtype=np.float64)
     if out.ndim != 2 or out.shape[1] != STATE_SIZE:
-        raise InputError(field, f"shape {out.shape}", f"shape (n, {STATE_SIZE}): q1..q5, dq1..dq5")
+        raise InputError(field, f"shape {out.shape}", allowed)
     bad = ~np.isfinite(out)
     if bad.any():
         n, i = np.argwhere(bad)[0]
         raise InputError(f"{field}[{n}][{i}]", float(out[n, i]), "finite rad and rad/s")
     return out
+
+
+def check_state(state: ArrayLike, field: str = "state") -> np.ndarray:
+    """Check one state, shape (10,), finite; returned as contiguous float64, or InputError."""
+    given = numbers(state, field, f"numbers, shape ({STATE_SIZE},): q1..q5, dq1..dq5")
+    return check_states(given[np.newaxis], field)[0]
 
 
 def simulate_steps(
@@ -217,10 +225,13 @@ def simulate_steps(
     model = model or WalkerModel()
     states = check_states(states)
     slopes = check_slopes(slopes)
-    previous = np.ascontiguousarray(previous_slopes, dtype=np.float64)
     n, m = states.shape[0], slopes.size
+    allowed = f"numbers, shape ({n},), as states"
+    previous = np.ascontiguousarray(
+        numbers(previous_slopes, "previous_slopes", allowed), dtype=np.float64
+    )
     if previous.shape != (n,):
-        raise InputError("previous_slopes", f"shape {previous.shape}", f"shape ({n},), as states")
+        raise InputError("previous_slopes", f"shape {previous.shape}", allowed)
     if not (np.abs(previous) <= SLOPE_LIMIT).all():
         i = int(np.argmax(~(np.abs(previous) <= SLOPE_LIMIT)))
         raise InputError(

@@ -18,7 +18,7 @@ from biped_mfpt_ros.gait.scratch import (
     WORKS,
     empty_scratch,
 )
-from biped_mfpt_ros.gait.step import check_states
+from biped_mfpt_ros.gait.step import check_state
 from biped_mfpt_ros.gait.swing import SAMPLE_COLUMNS, advance, begin
 from biped_mfpt_ros.jit import kernel
 from biped_mfpt_ros.lanes import LANES
@@ -108,7 +108,7 @@ def trace_swing(
         As `simulate_steps`.
     """
     model = model or WalkerModel()
-    start = check_states(np.asarray(state, dtype=np.float64)[None], "state")[0]
+    start = check_state(state)
     previous = float(check_slopes([previous_slope], "previous_slope")[0])
     after = np.zeros(STATE_SIZE)
     samples = np.zeros((_MOST_SAMPLES, SAMPLE_COLUMNS))
