@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -30,10 +31,11 @@ def graph():
 
 
 class HeldSimulator(Simulator):
-    """Answers nothing until it is told to, and remembers in which order it served its clients."""
+    """Answers nothing while its gate is closed, and remembers in which order it served clients."""
 
     def __init__(self):
         self.gate, self.order = threading.Event(), []
+        self.gate.set()
         super().__init__()
 
     def _simulate(self, request, response):
@@ -68,15 +70,28 @@ def wait_for_refusals(sent, number):
     wait_for(lambda: sum(future.done() for future in sent) == number, f"{number} refusals")
 
 
+def client_of(node, name, kind, asked):
+    """A client that the service knows where to answer: before, answers are lost."""
+    client = node.create_client(kind, name, qos_profile=REQUESTS)
+    wait_for(client.service_is_ready, name)
+    answered = False
+    while not answered:
+        future = client.call_async(asked)
+        with suppress(AssertionError):
+            answered = wait_for(future.done, f"an answer of {name}", timeout=2.0)
+    return client
+
+
 class Flooder(Node):
-    """Sends without waiting for answers."""
+    """Sends without waiting for answers, as soon as the service is held."""
 
     def __init__(self):
         super().__init__("flooder")
 
-    def flood(self, name, asked, count, kind=SimulateSteps):
-        client = self.create_client(kind, name, qos_profile=REQUESTS)
-        wait_for(client.service_is_ready, name)
+    def flood(self, held, name, asked, count, kind=SimulateSteps):
+        client = client_of(self, name, kind, asked)
+        held.gate.clear()
+        held.order.clear()
         return [client.call_async(asked) for _ in range(count)]
 
 
@@ -176,11 +191,11 @@ def test_a_flood_to_a_simulator_delays_nobody_else(graph):
     simulator = graph.start(HeldSimulator)
     flooder, tester = graph.start(Flooder), graph.start(Client)
     (name,) = wait_for(tester.simulators, "the simulator")
-    client = tester.create_client(SimulateSteps, name, qos_profile=REQUESTS)
-    wait_for(client.service_is_ready, name)
-    sent = flooder.flood(name, dear(), 200)
+    mine = request(np.zeros((1, 10)), client="tester")
+    client = client_of(tester, name, SimulateSteps, mine)
+    sent = flooder.flood(simulator, name, dear(), 200)
     wait_for_refusals(sent, 199 - MOST_WAITING)
-    mine = client.call_async(request(np.zeros((1, 10)), client="tester"))
+    mine = client.call_async(mine)
     wait_for_refusals(sent, 200 - MOST_WAITING)  # for which there is no room beside mine
     simulator.gate.set()
     assert result_of(mine).success
@@ -203,8 +218,7 @@ def test_an_answer_that_cannot_be_sent_keeps_no_other_back(graph):
     graph.start(Odd)
     tester = graph.start(Client)
     (name,) = wait_for(tester.simulators, "the simulator")
-    client = tester.create_client(SimulateSteps, name, qos_profile=REQUESTS)
-    wait_for(client.service_is_ready, name)
+    client = client_of(tester, name, SimulateSteps, request(np.zeros((1, 10)), client="tester"))
     odd = client.call_async(request(np.zeros((1, 10)), client="odd"))
     assert result_of(client.call_async(request(np.zeros((1, 10)), client="tester"))).success
     assert not odd.done()
@@ -217,7 +231,7 @@ def test_a_mesh_goes_on_at_a_flooded_simulator(graph):
     flooder, tester = graph.start(Flooder), graph.start(Client)
     name = f"/{flooded.get_name()}/simulate_steps"
     tester.wait_for_mesher()
-    sent = flooder.flood(name, dear(), 200)
+    sent = flooder.flood(flooded, name, dear(), 200)
     wait_for_refusals(sent, 199 - MOST_WAITING)
     handle = tester.send_goal(settings(threshold=1.0))
     wait_for(
@@ -240,14 +254,11 @@ def test_a_flood_of_questions_to_the_analysis_delays_neither_meshes_nor_others(g
     publisher = graph.start(Publisher)
     flooder, tester = graph.start(Flooder), graph.start(Client)
     compute = tester.service(ComputeMfpt, "compute_mfpt")
-    client = tester.create_client(ComputeMfpt, "compute_mfpt", qos_profile=REQUESTS)
-    wait_for(client.service_is_ready, "compute_mfpt")
+    client = client_of(tester, "compute_mfpt", ComputeMfpt, ask("a"))
     publisher.publish(mesh, "a")
     wait_for(lambda: compute(ask("a")).success, "the mesh")
-    analysis.gate.clear()
-    analysis.order.clear()
     sigmas = np.linspace(0.02, 0.1, 500)
-    sent = flooder.flood("compute_mfpt", ask("a", 0.0, sigmas), 200, ComputeMfpt)
+    sent = flooder.flood(analysis, "compute_mfpt", ask("a", 0.0, sigmas), 200, ComputeMfpt)
     wait_for_refusals(sent, 200 - 64 - 1)
     estimates = []
     tester.create_subscription(MfptEstimate, "mfpt", estimates.append, RESULTS)
@@ -278,7 +289,8 @@ def test_a_mesh_goes_on_beside_a_flooded_simulator(graph):
     flooder, tester = graph.start(Flooder), graph.start(Client)
     wait_for(lambda: len(mesher.simulators.found()) == 2, "both simulators")
     name = f"/{flooded.get_name()}/simulate_steps"
-    sent = flooder.flood(name, dear(), 100)
+    client = client_of(flooder, name, SimulateSteps, dear())
+    sent = [client.call_async(dear()) for _ in range(100)]
     status, result = tester.grow(settings(threshold=1.0))
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     for future in sent:

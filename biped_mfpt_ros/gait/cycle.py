@@ -187,7 +187,7 @@ def find_limit_cycle(
     raise NoLimitCycle(
         f"no limit cycle of {controller.name} found on a slope of {np.degrees(slope):g} degrees "
         f"with torque limit {model.torque_limit:g} N m and friction {model.friction:g}: "
-        f"{len(states)} starts, {walked + 1} steps, {reason}"
+        f"{len(states)} starts, {walked + 1} step{'s' if walked else ''} at most, {reason}"
     )
 
 
