@@ -129,6 +129,17 @@ def test_default_error_is_at_most_1e_6(name):
     assert np.abs(found.next_states - tight.next_states).max() <= 1e-6
 
 
+def test_a_torque_beyond_its_limit_between_two_stages_is_cut_off():
+    """For 2 ms of a step of 33 ms; left out, it would move the next state by 4e-6."""
+    q = [3.610864, 3.036726, -0.411109, -0.321248, -0.014467]
+    dq = [0.459041, -1.847721, -3.682364, 0.926897, 0.103176]
+    states, control = [q + dq], controller("hzd/base")
+    found = simulate_steps(control, states, [0.0], SLOPES)
+    tight = simulate_steps(control, states, [0.0], SLOPES, WalkerModel(tolerance=1e-12))
+    assert (found.outcomes == tight.outcomes).all()
+    assert np.abs(found.next_states - tight.next_states).max() <= 1e-6
+
+
 def test_error_falls_with_the_tolerance_as_the_order_says():
     """Eighth order: error ~ h^8 ~ 1 / steps^8, and in proportion to the tolerance.
 

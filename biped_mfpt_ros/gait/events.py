@@ -220,6 +220,47 @@ def _crossing(scheme, rob, par, w, lane, what, low, high, places, enough, span):
 
 
 @inner_kernel
+def _beyond_between(scheme, rob, par, w, lane, values, slack):
+    """Where torques are beyond their limits for less than a quarter of the step, by parabolas.
+
+    ``values`` are how far they are beyond at the fractions 0, 1/4 ... 1: nowhere by ``slack``.
+
+    Returns
+    -------
+    tuple
+        Fraction, how far they are beyond there, by ``slack`` at most if nowhere; evaluations made.
+    """
+    cut, _, _ = mode_of(w, lane)
+    j = 1
+    for k in range(2, 4):
+        if values[k] > values[j]:
+            j = k
+    at, part = 0.25 * j, 0.25
+    low, middle, high = values[j - 1], values[j], values[j + 1]
+    evaluations = 0
+    for _ in range(4):
+        bend = low - 2.0 * middle + high
+        if not bend < 0.0:
+            break
+        shift = min(max(0.5 * (low - high) / bend, -1.0), 1.0)
+        peak = middle + 0.5 * shift * (high - low) + 0.5 * shift * shift * bend
+        # What the torque differs from the parabola, by its spread.
+        if peak < -0.25 * (max(low, middle, high) - min(low, middle, high)):
+            break
+        at, part = min(max(at + shift * part, 0.25 * part), 1.0 - 0.25 * part), 0.25 * part
+        for n in range(LANES):
+            w[PLACES, AT, n] = min(at + (n - 1) * part, 1.0)
+        wanted, _, _ = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
+        store(w, PLACES, VALUE, beyond(rob, cut, wanted))
+        evaluations += LANES
+        for n in range(LANES):
+            if w[PLACES, VALUE, n] > slack:
+                return w[PLACES, AT, n], w[PLACES, VALUE, n], evaluations
+        low, middle, high = w[PLACES, VALUE, 0], w[PLACES, VALUE, 1], w[PLACES, VALUE, 2]
+    return at, middle, evaluations
+
+
+@inner_kernel
 def first_change(scheme, rob, par, w, lane, start, span):
     """When the first torque reaches its limit, or leaves it, and which.
 
@@ -239,16 +280,26 @@ def first_change(scheme, rob, par, w, lane, start, span):
     store(w, PLACES, VALUE, beyond(rob, cut, wanted))
     f0, f1 = w[PLACES, VALUE, 0], w[PLACES, VALUE, 1]
     f2, f3 = w[PLACES, VALUE, 2], w[PLACES, VALUE, 3]
+    evaluations = LANES
     if f0 <= slack and f1 <= slack and f2 <= slack and f3 <= slack:
-        return 2.0, -1, 0.0, LANES
-    # What is at the limit, to rounding, is not beyond it yet.
-    f0, f1, f2 = f0 - slack, f1 - slack, f2 - slack
-    values = (-math.inf, min(start, 0.0) - slack, f0, f1, f2, f3)
-    low, high, _, _, places = _narrow((0.0, 0.0, 0.25, 0.5, 0.75, 1.0), values, 1)
-    low, high = (low[0], min(low[1] + slack, -slack)), (high[0], high[1] + slack)
-    at, nearest, evaluations = _crossing(
+        at, value, more = _beyond_between(
+            scheme, rob, par, w, lane, (min(start, 0.0), f0, f1, f2, f3), slack
+        )
+        evaluations += more
+        if not value > slack:
+            return 2.0, -1, 0.0, evaluations
+        low, high = (0.0, min(start, -slack)), (at, value)
+        places = (0.2 * at, 0.4 * at, 0.6 * at, 0.8 * at)
+    else:
+        # What is at the limit, to rounding, is not beyond it yet.
+        f0, f1, f2 = f0 - slack, f1 - slack, f2 - slack
+        values = (-math.inf, min(start, 0.0) - slack, f0, f1, f2, f3)
+        low, high, _, _, places = _narrow((0.0, 0.0, 0.25, 0.5, 0.75, 1.0), values, 1)
+        low, high = (low[0], min(low[1] + slack, -slack)), (high[0], high[1] + slack)
+    at, nearest, more = _crossing(
         scheme, rob, par, w, lane, TORQUES, low, high, places, 0.1 * slack, span
     )
+    evaluations += more
     joint, held = 0, 0.0
     farthest = -math.inf
     for i in range(4):
@@ -261,7 +312,7 @@ def first_change(scheme, rob, par, w, lane, start, span):
             held = 0.0
             if sign == 0.0:
                 held = 1.0 if torque > 0.0 else -1.0
-    return at, joint, held, LANES + evaluations
+    return at, joint, held, evaluations
 
 
 @inner_kernel

@@ -139,6 +139,7 @@ _LONGEST_STEP = FOOT_PARTS * FOOT_INTERVAL  # s
 _SHORTEST_STEP = 1e-9  # s, up to an event
 _OFF_CUBIC = 3e-3  # m: what the height of the foot differs from a cubic over a step, at most
 _LEAST_ROOT = 0.5623  # of an error of 0.01: smaller ones tell nothing about how errors grow
+_BETWEEN_STAGES = 0.02  # of the torque limit: how much more a torque may be than at any stage
 _TRACE_SAMPLES = 8  # of every integrator step
 SAMPLE_COLUMNS = 18  # of a trace: t, a (5), da (5), u (4), tangential, normal force, energy
 
@@ -422,7 +423,7 @@ def _inspect(scheme, rob, par, w, v, lane, ahead):
         return False
     w[MODE, GOOD, lane] = 1.0
     v[STEPS, lane] += 1.0
-    changes = w[ESTIMATE, BEYOND, lane] > CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
+    changes = _may_cut(rob, w, v, lane)
     switched = w[MODE, SWITCHED, lane] > 0.5
     switches = (switch(scheme, par, lane_angles(w, Y_NEW, lane)) > 0.0) == switched
     least = min(w[ESTIMATE, LEAST, lane], v[MARGIN, lane])
@@ -449,6 +450,18 @@ def _inspect(scheme, rob, par, w, v, lane, ahead):
     v[SLIPS, lane] = 1.0 if slips else 0.0
     v[NEAR, lane] = 1.0 if near else 0.0
     return changes or switches or slips or near or slide
+
+
+@inner_kernel
+def _may_cut(rob, w, v, lane):
+    """Whether a torque may reach or leave its limit in the step.
+
+    One that is nearest to it within the step may get there between two stages.
+    """
+    most = w[ESTIMATE, BEYOND, lane]
+    if most > max(v[START_BEYOND, lane], w[ESTIMATE, CLEARANCE, lane]):
+        return most > -_BETWEEN_STAGES * rob[r.TORQUE_LIMIT]
+    return most > CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
 
 
 @inner_kernel

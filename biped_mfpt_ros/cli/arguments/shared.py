@@ -119,7 +119,7 @@ def shared_options() -> dict[str, Parser]:
         "--tolerance",
         type=number,
         metavar="TOL",
-        help="local error of the integrator, rad and rad/s (default: 2e-8)",
+        help="local error of the integrator, rad and rad/s (default: 4e-8)",
     )
 
     terrain = group("terrain", "terrain")
