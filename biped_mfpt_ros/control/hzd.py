@@ -106,10 +106,11 @@ def double_support(joints: np.ndarray, robot: Robot) -> np.ndarray:
         of the stance foot.
     """
     q = np.append(joints, 0.0)
-    s, c = np.array([sine_cosine(angle) for angle in weighted_sum(q, ABSOLUTE.T)]).T
+    # Not compiled, as what only reads parameters should not wait for a compiler.
+    s, c = np.array([sine_cosine.py_func(a) for a in weighted_sum(q, ABSOLUTE.T).tolist()]).T
     foot = robot.swing_foot_position
     # Turning the whole robot by -phi brings a foot that stands at angle phi to angle zero.
-    q[4] = -direction(-weighted_sum(foot, s), weighted_sum(foot, c))
+    q[4] = -direction(-float(weighted_sum(foot, s)), float(weighted_sum(foot, c)))
     return q
 
 

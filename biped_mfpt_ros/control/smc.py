@@ -29,6 +29,8 @@ milliseconds at most, within which they move it by some 1e-6 rad.
 from __future__ import annotations
 
 import math
+from decimal import Context, Decimal
+from functools import lru_cache
 
 import numpy as np
 
@@ -85,6 +87,9 @@ STIFF = 1000.0
 _REF1, _REF2, _K, _EXPONENT, _RATE, _WIDTH = 0, 4, 8, 12, 16, 20
 _PER_K, _PER_EXPONENT, _WIDTH_4, _POWER_4 = 24, 28, 32, 36
 PACKED_SIZE = 40
+
+# The C library's power differs from machine to machine. Beyond its range it is 0 or infinite.
+_POWER = Context(prec=18, traps=[])
 
 _ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to an integer
 _SQRT_HALF = math.sqrt(0.5)
@@ -298,6 +303,14 @@ def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.nda
     return impact_map(state, robot)[0]
 
 
+@lru_cache(maxsize=256)
+def _width(k: float, exponent: float) -> float:
+    """w where ``k w^exponent = STEEPEST w``; a plain PD law (exponent 1) needs no such range."""
+    if exponent >= 1.0:
+        return 0.0
+    return float(_POWER.power(Decimal(k / STEEPEST), Decimal(1.0 / (1.0 - exponent))))
+
+
 def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     """Parameters as the kernels read them.
 
@@ -331,8 +344,7 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     out[_REF2 : _REF2 + 4] = ref2, q3, q4_2, torso
     for i in range(4):
         k, exponent = float(parameters[6 + i]), 2.0 * float(parameters[10 + i]) - 1.0
-        # Where k w^exponent = STEEPEST w; a plain PD law (exponent 1) needs no such range.
-        width = power(k / STEEPEST, 1.0 / (1.0 - exponent)) if exponent < 1.0 else 0.0
+        width = _width(k, exponent)
         out[_K + i], out[_EXPONENT + i], out[_WIDTH + i] = k, exponent, width
         out[_RATE + i] = 1.0 / parameters[14 + i]
         out[_PER_K + i] = 1.0 / k

@@ -59,8 +59,7 @@ def sine_cosine(angle):
     return negated_if_odd(x + x * z * sine, rounded), negated_if_odd(1.0 + z * cosine, rounded)
 
 
-@inner_kernel
-def direction(x, y):
+def direction(x: float, y: float) -> float:
     """Angle of the vector (x, y) from the first axis, rad, -pi to pi.
 
     The same bits on every machine, unlike the C library's: by Newton's method on `sine_cosine`.
@@ -72,7 +71,7 @@ def direction(x, y):
         angle = math.pi if y >= 0.0 else -math.pi
     # At most 45 degrees are left. An error e becomes e^3 / 3 or less: 0.22, 4e-3, 2e-8, rounding.
     for _ in range(5):
-        s, c = sine_cosine(angle)
+        s, c = sine_cosine.py_func(angle)
         angle += (y * c - x * s) / (x * c + y * s)
     return angle
 
