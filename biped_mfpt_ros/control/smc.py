@@ -305,7 +305,7 @@ def reference_state(parameters: np.ndarray, rate: float, robot: Robot) -> np.nda
 
 @lru_cache(maxsize=256)
 def _width(k: float, exponent: float) -> float:
-    """w where ``k w^exponent = STEEPEST w``; a plain PD law (exponent 1) needs no such range."""
+    """Half width, where ``k w^exponent = STEEPEST w``; a PD law (exponent 1) needs none."""
     if exponent >= 1.0:
         return 0.0
     return float(_POWER.power(Decimal(k / STEEPEST), Decimal(1.0 / (1.0 - exponent))))
