@@ -34,11 +34,12 @@ class HeldSimulator(Simulator):
     """Answers nothing while its gate is closed, and remembers in which order it served clients."""
 
     def __init__(self):
-        self.gate, self.order = threading.Event(), []
+        self.gate, self.held, self.order = threading.Event(), threading.Event(), []
         self.gate.set()
         super().__init__()
 
     def _simulate(self, request, response):
+        self.held.set()
         self.gate.wait(PATIENCE)
         self.order.append(request.client)
         return super()._simulate(request, response)
@@ -48,7 +49,7 @@ class HeldAnalysis(Analysis):
     """The same of an analysis; with the meshes of which it published an estimate."""
 
     def __init__(self):
-        self.gate, self.order = threading.Event(), []
+        self.gate, self.held, self.order = threading.Event(), threading.Event(), []
         self.gate.set()
         super().__init__()
         publish = self._estimates.publish
@@ -60,6 +61,7 @@ class HeldAnalysis(Analysis):
         self._estimates.publish = publish_in_order
 
     def _compute(self, request, response):
+        self.held.set()
         self.gate.wait(PATIENCE)
         self.order.append(request.client)
         return super()._compute(request, response)
@@ -91,8 +93,12 @@ class Flooder(Node):
     def flood(self, held, name, asked, count, kind=SimulateSteps):
         client = client_of(self, name, kind, asked)
         held.gate.clear()
+        held.held.clear()
         held.order.clear()
-        return [client.call_async(asked) for _ in range(count)]
+        first = client.call_async(asked)
+        # It is served alone; the others wait, or are refused.
+        wait_for(held.held.is_set, "the first request to be held")
+        return [first, *(client.call_async(asked) for _ in range(count - 1))]
 
 
 def mesh_of(threshold):
