@@ -610,7 +610,7 @@ def test_mesh_is_taken_in_whichever_order_its_messages_come(graph, tester, mesh_
 def compute(mesh_here):
     with ros_graph() as graph, pytest.MonkeyPatch.context() as patch:
         tester = graph.start(Client)
-        analysis = graph.start(Analysis)
+        graph.start(Analysis)
         publisher = graph.start(Publisher)
         publisher.publish(mesh_here, "good")
         compute = tester.service(ComputeMfpt, "compute_mfpt")
