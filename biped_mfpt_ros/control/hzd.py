@@ -13,7 +13,7 @@ import numpy as np
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
-from biped_mfpt_ros.walker.dynamics import direction, sine_cosine
+from biped_mfpt_ros.walker.dynamics import direction, plain_sine_cosine
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import ABSOLUTE, Robot, rabbit, weighted_sum
 
@@ -106,8 +106,7 @@ def double_support(joints: np.ndarray, robot: Robot) -> np.ndarray:
         of the stance foot.
     """
     q = np.append(joints, 0.0)
-    # Not compiled, as what only reads parameters should not wait for a compiler.
-    s, c = np.array([sine_cosine.py_func(a) for a in weighted_sum(q, ABSOLUTE.T).tolist()]).T
+    s, c = np.array([plain_sine_cosine(a) for a in weighted_sum(q, ABSOLUTE.T).tolist()]).T
     foot = robot.swing_foot_position
     # Turning the whole robot by -phi brings a foot that stands at angle phi to angle zero.
     q[4] = -direction(-float(weighted_sum(foot, s)), float(weighted_sum(foot, c)))

@@ -43,8 +43,7 @@ _C6 = -1.10124905199128749597e-11
 _ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to an integer
 
 
-@inner_kernel
-def sine_cosine(angle):
+def plain_sine_cosine(angle):
     """Sine and cosine at once, to within 3e-15 for angles up to 1e5 rad.
 
     The C library's differ in their last bit from machine to machine, with the instructions that it
@@ -59,10 +58,15 @@ def sine_cosine(angle):
     return negated_if_odd(x + x * z * sine, rounded), negated_if_odd(1.0 + z * cosine, rounded)
 
 
+sine_cosine = inner_kernel(plain_sine_cosine)
+"""The same for kernels: what only reads parameters should not wait for a compiler."""
+
+
 def direction(x: float, y: float) -> float:
     """Angle of the vector (x, y) from the first axis, rad, -pi to pi.
 
-    The same bits on every machine, unlike the C library's: by Newton's method on `sine_cosine`.
+    By Newton's method on `plain_sine_cosine`: the same bits on every machine, unlike the C
+    library's.
     """
     angle = 0.0
     if abs(y) > abs(x):
@@ -71,7 +75,7 @@ def direction(x: float, y: float) -> float:
         angle = math.pi if y >= 0.0 else -math.pi
     # At most 45 degrees are left. An error e becomes e^3 / 3 or less: 0.22, 4e-3, 2e-8, rounding.
     for _ in range(5):
-        s, c = sine_cosine.py_func(angle)
+        s, c = plain_sine_cosine(angle)
         angle += (y * c - x * s) / (x * c + y * s)
     return angle
 
