@@ -10,14 +10,17 @@ import re
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
 
 from biped_mfpt_ros.chain.markov import slope_probabilities
 from biped_mfpt_ros.chain.mesh import grow_mesh
-from biped_mfpt_ros.cli import main
+from biped_mfpt_ros.cli import CommandError, main
+from biped_mfpt_ros.cli import reproduce as cli_reproduce
 from biped_mfpt_ros.control.controller import controller, paper_controller_names
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
@@ -388,6 +391,43 @@ class TestWork:
         assert steps[False, 50.0, -1.0]["fell"]
         assert steps[True, 50.0, 0.0]["steps"] == 20
         assert steps[True, 50.0, -9.0]["fell"] is None
+
+
+@pytest.mark.parametrize("deaf", [0, 1, cli_reproduce._MOST_TRIES])
+def test_a_mesh_is_grown_again_if_its_recorder_misses_the_mfpt(tmp_path, monkeypatch, deaf):
+    """A recorder that an analysis finds too late hears nothing of it, and never will."""
+    from biped_mfpt_ros.cli.client import WaitedInVain
+
+    (job,) = make_plan(["hzd/cot"], quick=True).of("mesh")[:1]
+    recorders, solved = [], []
+
+    def add(make, name, **parameters):
+        Path(parameters["bag"].strip("'")).mkdir()  # a second recorder refuses what is there
+        heard = 0 if len(recorders) < deaf else len(cli_reproduce.SIGMA_DEG["hzd"])
+        recorders.append(Mock(failed=False, counts={"mfpt": heard}))
+        return recorders[-1]
+
+    def wait(condition, timeout, what):
+        if not condition():
+            raise WaitedInVain(what)
+
+    client = MagicMock(add=add, wait=wait)
+    client.__enter__.return_value = client
+    monkeypatch.setattr("biped_mfpt_ros.cli.client.Client", lambda *_: client)
+    monkeypatch.setattr(cli_reproduce, "_grow", lambda *_: {"mesh_id": "m"})
+    monkeypatch.setattr(cli_reproduce, "_missing_in_bag", lambda *_: "")
+    monkeypatch.setattr(cli_reproduce, "_solve", lambda *arguments: solved.append(arguments[2]))
+    study = Mock(plan=Mock(controllers=["hzd/cot"]), seconds={})
+    grow = partial(cli_reproduce._meshes, study, [job], Mock(), tmp_path)
+    if deaf < cli_reproduce._MOST_TRIES:
+        grow()
+        assert [grown.job for grown in solved] == [job]
+        assert len(recorders) == deaf + 1
+    else:
+        with pytest.raises(CommandError, match=f"{job.name}.*without its MFPT"):
+            grow()
+        assert len(recorders) == deaf
+    assert all(recorder.close.called for recorder in recorders)
 
 
 # With the nodes, of the controller whose meshes have a few dozen states.

@@ -47,6 +47,10 @@ class AnalysisFailed(CommandError):
     """The analysis could not tell an MFPT; the message says why."""
 
 
+class WaitedInVain(CommandError):
+    """What was waited for did not come in time."""
+
+
 class Client:
     """Client of a pipeline in one namespace. Use it as a context manager.
 
@@ -168,11 +172,11 @@ class Client:
         )
 
     def wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
-        """Wait until a condition holds; CommandError after ``timeout`` seconds."""
+        """Wait until a condition holds; WaitedInVain after ``timeout`` seconds."""
         deadline = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > deadline:
-                raise CommandError(f"waited {timeout:g} s for {what}")
+                raise WaitedInVain(f"waited {timeout:g} s for {what}")
             self._spin()
 
     def grow_mesh(

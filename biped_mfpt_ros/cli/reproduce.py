@@ -286,11 +286,11 @@ def _meshes(study: _Study, jobs: Sequence[Job], pipeline: Pipeline, directory: P
                 partial(client.listens, name, RECORDED), START_TIMEOUT, f"{name} to come up"
             )
             result = _grow(study, job, client)
-            _wait_for_estimates(study, job, client, result["mesh_id"], recorder)
+            heard = _wait_for_estimates(study, job, client, result["mesh_id"], recorder)
             recorder.close()
             client.remove(recorder)
             recorder = None
-            problem = _missing_in_bag(bag, result["mesh_id"])
+            problem = _missing_in_bag(bag, result["mesh_id"]) if heard else "without its MFPT"
             if not problem:
                 result["bag"] = str(bag.relative_to(directory))
                 asked = client.ask_mfpt(result["mesh_id"], 0.0, _sigmas(job))
@@ -358,22 +358,32 @@ def _published_deg(study: _Study) -> list[float]:
 
 def _wait_for_estimates(
     study: _Study, job: Job, client: Client, mesh_id: str, recorder: Recorder
-) -> None:
-    """Wait until a recorder has what the analysis publishes of a mesh."""
+) -> bool:
+    """Wait until a recorder has what the analysis publishes of a mesh.
+
+    Returns whether it has: it gets nothing from an analysis that has not found it yet, which may
+    take longer on a busy machine than a small mesh.
+    """
+    from biped_mfpt_ros.cli.client import WaitedInVain
+
     sigmas = [options.spread("sigma", degrees) for degrees in _published_deg(study)]
     study.show(job, "waiting for the analysis")
     try:
         client.published_mfpt(mesh_id, 0.0, sigmas, _PATIENCE)
-    except CommandError:
+    except WaitedInVain:
         # It ends at the first that it cannot compute.
         solved = itertools.takewhile(
             lambda sigma_s: _estimate(study, job, client, mesh_id, sigma_s), sigmas
         )
         sigmas = list(solved)
         client.published_mfpt(mesh_id, 0.0, sigmas, RESULT_TIMEOUT)
-    client.wait(
-        lambda: recorder.counts.get("mfpt", 0) >= len(sigmas), RESULT_TIMEOUT, "the recorder"
-    )
+    try:
+        client.wait(
+            lambda: recorder.counts.get("mfpt", 0) >= len(sigmas), _PATIENCE, "the recorder"
+        )
+    except WaitedInVain:
+        return False
+    return True
 
 
 def _solve(study: _Study, client: Client, grown: _Grown) -> None:
