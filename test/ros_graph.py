@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from biped_mfpt_ros.nodes.answers import ActionClient, accepted
+from biped_mfpt_ros.nodes.answers import ActionClient, Answer, accepted
 from biped_mfpt_ros.nodes.assembly import MeshAssembly
 from biped_mfpt_ros.nodes.messages import settings_message
 from biped_mfpt_ros.nodes.qos import REQUESTS, RESULTS
@@ -130,6 +130,21 @@ def asked(client, request):
     raise AssertionError(f"no answer to {len(futures)} requests")
 
 
+def goal_handle(send):
+    """Handle of a goal that is sent; ``ended`` of an accepted one brings its result.
+
+    That is asked for at once, since rclpy keeps it for 10 s only.
+    """
+    handle = result_of(accepted(send))
+    handle.ended = Answer(handle.get_result_async) if handle.accepted else None
+    return handle
+
+
+def cancel(handle):
+    """Have a goal cancelled."""
+    return result_of(Answer(handle.cancel_goal_async))
+
+
 class Client(Node):
     """Client of everything, and listener to the topics of the mesh."""
 
@@ -185,9 +200,7 @@ class Client(Node):
         self.wait_for_mesher()
         goal = GrowMesh.Goal(settings=settings)
         callback = None if feedback is None else lambda m: feedback(m.feedback.progress)
-        return result_of(
-            accepted(lambda: self._grow.send_goal_async(goal, feedback_callback=callback))
-        )
+        return goal_handle(lambda: self._grow.send_goal_async(goal, feedback_callback=callback))
 
     def send_goal_to(self, mesher, settings):
         """Handle of a goal for a mesher by the name of its node.
@@ -209,7 +222,7 @@ class Client(Node):
         return self.outcome(handle)
 
     def outcome(self, handle, timeout=PATIENCE):
-        answer = result_of(handle.get_result_async(), timeout)
+        answer = result_of(handle.ended, timeout)
         return answer.status, answer.result
 
     def mesh(self, mesh_id):

@@ -12,7 +12,7 @@ from biped_mfpt_msgs.msg import Controller as ControllerMsg
 from biped_mfpt_msgs.msg import MfptEstimate
 from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
 from rclpy.node import Node
-from ros_graph import PATIENCE, Client, result_of, ros_graph, wait_for
+from ros_graph import PATIENCE, Client, cancel, result_of, ros_graph, wait_for
 from test_nodes import BASE, Publisher, ask, assert_same_mesh, grown_here, request, settings
 
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
@@ -309,6 +309,6 @@ def test_goals_beyond_a_bound_are_rejected_at_once(graph):
     handles = [tester.send_goal(settings()) for _ in range(10)]
     assert [handle.accepted for handle in handles] == [True] * 4 + [False] * 6
     for handle in handles[:4]:
-        result_of(handle.cancel_goal_async())
+        cancel(handle)
     statuses = [tester.outcome(handle)[0] for handle in handles[:4]]
     assert statuses == [GoalStatus.STATUS_CANCELED] * 4

@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from biped_mfpt_msgs.msg import MeshInfo, MeshProgress, MeshStates, MeshTransiti
 from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from ros_graph import PATIENCE, Client, ros_graph, wait_for
+from ros_graph import PATIENCE, Client, cancel, ros_graph, wait_for
 
 from biped_mfpt_ros.chain.markov import metastability
 from biped_mfpt_ros.chain.mesh import grow_mesh
@@ -414,7 +415,7 @@ def test_cancel_is_prompt_and_goals_wait_their_turn(graph, tester):
     assert third.accepted
     assert not tester.send_goal(settings()).accepted
     for handle in (third, first):
-        handle.cancel_goal_async()
+        cancel(handle)
         status, result = tester.outcome(handle)
         assert status == GoalStatus.STATUS_CANCELED
         assert "cancelled" in result.message
@@ -457,7 +458,7 @@ def test_several_meshes_grow_at_once_and_each_is_the_one_grown_here(graph, teste
         assert_same_mesh(mesh, grown_here(one, find_limit_cycle(one.controller).state))
         assert result.swings == result.states - 1
     assert long.status in (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING)
-    long.cancel_goal_async()
+    cancel(long)
     assert tester.outcome(long)[0] == GoalStatus.STATUS_CANCELED
 
 
@@ -615,15 +616,29 @@ def compute(mesh_here):
         publisher.publish(mesh_here, "good")
         compute = tester.service(ComputeMfpt, "compute_mfpt")
         wait_for(lambda: compute(ask("good")).success, "the mesh")
-        # s since the last message of a mesh: they have been sent, and come within milliseconds.
-        patch.setattr("biped_mfpt_ros.nodes.analysis._PATIENCE", 2.0)
+        jumps = []
+        clock = SimpleNamespace(
+            monotonic=lambda: time.monotonic() + sum(jumps), perf_counter=time.perf_counter
+        )
+        patch.setattr("biped_mfpt_ros.nodes.analysis.time", clock)
+        patch.setattr("biped_mfpt_ros.nodes.analysis._PATIENCE", PATIENCE)
         publisher.publish(mesh_here, "gap", lost=[(1, 1)])
         publisher.publish(mesh_here, "failed", status=MeshInfo.FAILED)
         publisher.publish(mesh_here, "open", lost=[(0, 1)])
         publisher.publish(mesh_here, "unended", lost=[(2, 0)])
-        # The topics arrive in any order.
-        wait_for(lambda: "messages were lost" in compute(ask("gap")).message, "the gap")
-        wait_for(lambda: "messages were lost" in compute(ask("unended")).message, "the end")
+        # The topics arrive in any order; what has not come when all the rest has was lost.
+        n = len(mesh_here.states)
+
+        def wait_until_told(mesh_id, *said):
+            wait_for(lambda: all(s in compute(ask(mesh_id)).message for s in said), mesh_id)
+
+        wait_until_told("gap", f"the transitions of {n} ", "from index 2 to before ")
+        wait_until_told("failed", "it failed")
+        wait_until_told("open", f"it is not finished: {n} states")
+        wait_until_told("unended", f"of {n} states {n} have come")
+        jumps.append(2.0 * PATIENCE)
+        wait_until_told("gap", "messages were lost")
+        wait_until_told("unended", "messages were lost")
         yield compute
 
 

@@ -10,11 +10,11 @@ from action_msgs.msg import GoalStatus
 from biped_mfpt_msgs.action import Optimise
 from biped_mfpt_msgs.msg import OptimisationTrial
 from rclpy.node import Node
-from ros_graph import PATIENCE, result_of, ros_graph, wait_for
+from ros_graph import PATIENCE, cancel, goal_handle, result_of, ros_graph, wait_for
 
 from biped_mfpt_ros.control.controller import controller
 from biped_mfpt_ros.nodes.analysis import Analysis
-from biped_mfpt_ros.nodes.answers import ActionClient, accepted
+from biped_mfpt_ros.nodes.answers import ActionClient
 from biped_mfpt_ros.nodes.mesher import Mesher
 from biped_mfpt_ros.nodes.messages import controller_message
 from biped_mfpt_ros.nodes.optimiser import (
@@ -60,18 +60,16 @@ class Client(Node):
 
     def send(self, goal):
         wait_for(self.action.server_is_ready, "the optimiser")
-        handle = result_of(
-            accepted(
-                lambda: self.action.send_goal_async(
-                    goal, feedback_callback=lambda m: self.feedback.append(m.feedback)
-                )
+        handle = goal_handle(
+            lambda: self.action.send_goal_async(
+                goal, feedback_callback=lambda m: self.feedback.append(m.feedback)
             )
         )
         assert handle.accepted
         return handle
 
     def run(self, goal):
-        return result_of(self.send(goal).get_result_async())
+        return result_of(self.send(goal).ended)
 
 
 @pytest.fixture(scope="module")
@@ -163,8 +161,8 @@ def test_a_cancelled_study_goes_on_later(client, store_path, tmp_path):
     answer = client.run(goal_message("three", SETTINGS))
     assert answer.status == GoalStatus.STATUS_ABORTED
     assert "another study is running" in answer.result.message
-    result_of(handle.cancel_goal_async())
-    answer = result_of(handle.get_result_async())
+    cancel(handle)
+    answer = result_of(handle.ended)
     assert answer.status == GoalStatus.STATUS_CANCELED
     assert answer.result.message == "stopped"
     assert {t.status for t in kept(store_path, "two")} <= {"done", "pending"}
@@ -199,8 +197,8 @@ def test_a_flood_of_goals_and_cancels_leaves_a_study_alone(
     before = len(client.trials)
     # Three generations, so that the first 20 trials are done.
     wait_for(lambda: len(client.trials) > max(before + 5, 40), "more trials of the study")
-    result_of(running.cancel_goal_async())
-    answer = result_of(running.get_result_async())
+    cancel(running)
+    answer = result_of(running.ended)
     assert (answer.status, answer.result.message) == (GoalStatus.STATUS_CANCELED, "stopped")
     found = outline(kept(store_path, "flooded"))
     expected = locally(tmp_path / "l.sqlite", 20)
@@ -288,8 +286,8 @@ def test_without_a_pipeline_a_study_ends_and_says_why(graph, tmp_path):
 
     alone = graph.start(Alone)
     wait_for(alone.action.server_is_ready, "the optimiser")
-    handle = result_of(alone.action.send_goal_async(goal_message("none", SETTINGS)))
-    answer = result_of(handle.get_result_async())
+    handle = goal_handle(lambda: alone.action.send_goal_async(goal_message("none", SETTINGS)))
+    answer = result_of(handle.ended)
     assert answer.status == GoalStatus.STATUS_ABORTED
     assert "no mesher took a mesh" in answer.result.message
     assert [t.status for t in kept(path, "none")] == ["pending"]
@@ -302,7 +300,7 @@ def test_a_node_that_is_replaced_costs_nothing(graph, client, store_path, tmp_pa
     goal = goal_message(f"without_{kind.__name__}", SETTINGS)
     goal.max_trials = 30
     client.trials.clear()
-    result = client.send(goal).get_result_async()
+    result = client.send(goal).ended
     wait_for(lambda: len(client.trials) > 5, "some trials")
     node = next(node for node, _, _ in graph._nodes if isinstance(node, kind))
     graph.stop(node)
@@ -329,7 +327,7 @@ def test_a_node_that_dies_costs_no_study(graph, victim, tmp_path):
     client = graph.start(lambda: Client(namespace))
     goal = goal_message("killed", SETTINGS)
     goal.max_trials = 40
-    result = client.send(goal).get_result_async()
+    result = client.send(goal).ended
     wait_for(lambda: len(client.trials) > 5, "some trials")
     processes[victim].send_signal(signal.SIGKILL)
     processes[victim].wait()
@@ -337,7 +335,7 @@ def test_a_node_that_dies_costs_no_study(graph, victim, tmp_path):
         wait_for(lambda: not client.action.server_is_ready(), "its end")
     launch(victim)
     if victim == "optimiser":  # the study goes on when it is asked for again
-        result = client.send(goal).get_result_async()
+        result = client.send(goal).ended
     assert result_of(result).result.success
     graph.stop(client)
     assert outline(kept(path, "killed")) == locally(tmp_path / "l.sqlite", 40)

@@ -105,7 +105,8 @@ def test_pipeline_of_processes(graph, client):
 
         wait_for(grown_by_all, f"a mesh grown by {count} simulators")
     wait_for(lambda: len(estimates) == len(published), "an estimate for every mesh")
-    assert [estimate.mesh_id for estimate in estimates] == published
+    # An analysis that starts late gets what was published meanwhile in any order.
+    assert sorted(estimate.mesh_id for estimate in estimates) == sorted(published)
     assert len({estimate.mfpt for estimate in estimates}) == 1
 
     # A simulator that is stopped takes requests and does not answer; then it is killed.

@@ -14,7 +14,7 @@ from biped_mfpt_msgs.msg import MeshInfo
 from rclpy.action import ActionServer
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from ros_graph import DOMAIN, PATIENCE, Client, ros_graph, wait_for
+from ros_graph import DOMAIN, PATIENCE, Client, cancel, ros_graph, wait_for
 from test_nodes import assert_same_mesh, grown_here, settings
 
 from biped_mfpt_ros.cli import client as cli
@@ -200,7 +200,7 @@ def test_journal_is_kept_for_a_mesh_that_lost_its_simulators_and_removed_with_a_
     handle = tester.send_goal(endless)
     wait_for(lambda: again.count > 20, "work")
     assert len(journals(tmp_path)) == 1
-    handle.cancel_goal_async()
+    cancel(handle)
     assert tester.outcome(handle)[0] == GoalStatus.STATUS_CANCELED
     assert journals(tmp_path) == []
     # Equal goals side by side do not share a journal, and a directory that cannot be is said.
