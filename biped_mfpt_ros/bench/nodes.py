@@ -146,11 +146,11 @@ class Nodes:
             "the nodes to come up",
         )
         # A goal may be lost until the mesher has found this client, and then it answers: here, that
-        # it has no such goal to cancel.
+        # it has no such goal. The client of results is the last that an action client makes.
         none = ClientGoalHandle(
             self._grow, UUID(uuid=[1] * 16), GrowMesh.Impl.SendGoalService.Response()
         )
-        self.spin(Answer(none.cancel_goal_async).done, timeout, "an answer of the mesher")
+        self.spin(Answer(none.get_result_async).done, timeout, "an answer of the mesher")
 
     def spin_once(self, timeout: float) -> None:
         """Take what comes within a time, s."""

@@ -131,10 +131,17 @@ class Live:
         self.grow = ActionClient(self._nodes.node, GrowMesh, "grow_mesh")
         self._wait(self.grow.server_is_ready, "the mesher", _START)
 
-    def service(self, kind: Any, name: str) -> Callable[[Any], Any]:
-        """Function that calls a service of a node."""
+    def service(self, kind: Any, name: str, greet: bool = True) -> Callable[[Any], Any]:
+        """Function that calls a service of a node.
+
+        Answers are lost until the node has found the client. With ``greet`` an empty request is
+        sent before, again and again until it is answered. A node finds clients in the order in
+        which they are made, so that the last of several is enough.
+        """
         client = self._nodes.node.create_client(kind, name, qos_profile=REQUESTS)
         self._wait(client.service_is_ready, name, _START)
+        if greet:
+            self.result(Answer(lambda: client.call_async(kind.Request())), name)
         return lambda request: self.result(client.call_async(request), name)
 
     def result(self, future: Future[Any] | Answer, what: str) -> Any:
@@ -190,14 +197,14 @@ class Live:
         """Result of a goal, which is cancelled after some seconds."""
         handle = self.result(accepted(lambda: client.send_goal_async(goal)), "an action")
         check(handle.accepted, "a goal was rejected, which does not say why")
-        ended = handle.get_result_async()
+        ended = Answer(handle.get_result_async)
         deadline = time.monotonic() + seconds
         while not ended.done() and time.monotonic() < deadline:
             self.check_alive()
             self._nodes.spin_once(0.02)
         cancelled = not ended.done()
         if cancelled:
-            self.result(handle.cancel_goal_async(), "a cancel")
+            self.result(Answer(handle.cancel_goal_async), "a cancel")
         answer = self.result(ended, "an action")
         if cancelled and answer.status == GoalStatus.STATUS_CANCELED:
             answer.result.success = True
@@ -280,9 +287,9 @@ def ask_for_goals(live: Live) -> Iterator[Callable[[Random], None]]:
     services = [
         (
             goal,
+            live.service(kind.Impl.SendGoalService, f"{name}/_action/send_goal", greet=False),
             live.service(CancelGoal, f"{name}/_action/cancel_goal"),
             live.service(kind.Impl.GetResultService, f"{name}/_action/get_result"),
-            live.service(kind.Impl.SendGoalService, f"{name}/_action/send_goal"),
             kind.Impl,
         )
         for name, kind, goal in (
@@ -292,7 +299,7 @@ def ask_for_goals(live: Live) -> Iterator[Callable[[Random], None]]:
     ]
 
     def give(random: Random) -> None:
-        goal, cancel, get_result, send, kind = random.choice(services)
+        goal, send, cancel, get_result, kind = random.choice(services)
         goal_id = UUID(uuid=array("B", random.choice((random.randbytes(16), bytes(16)))))
         what = random.random()
         if what < 0.5:
