@@ -58,6 +58,8 @@ class Forgetful(Node):
         self._on_loss = on_loss
         self.executed = 0
         self.questions = []
+        self.early = 0
+        """Questions that come before the last message of their mesh."""
 
         def execute(goal):
             self.executed += 1
@@ -93,7 +95,10 @@ class Forgetful(Node):
             self._lost_questions -= 1
             self._on_loss()
             await Future()
-        if request.sigma_s:
+        if request.sigma_s and self.early:
+            self.early -= 1
+            response.message = "mesh_id: 'm' is not allowed; allowed: a complete mesh"
+        elif request.sigma_s:
             response.success = True
             response.estimates = [MfptEstimate(mfpt=7.0)]
         return response
@@ -202,6 +207,17 @@ def test_a_run_survives_lost_answers(graph, run_client, later):
     settings = MeshSettings(BASE, WalkerModel(), slope_set(1.0), 1.0)
     assert run_client.grow_mesh(settings, lambda progress: None).mesh_id == "grown"
     assert node.executed == 1
+
+
+def test_a_run_asks_for_an_mfpt_that_is_not_published(graph, run_client, later, monkeypatch):
+    """As where the chain takes long; the last of the mesh, or the answer, may come late, too."""
+    monkeypatch.setattr("biped_mfpt_ros.cli.client._PUBLISHED", 0.1)
+    node = graph.start(lambda: Forgetful(GrowMesh, "grow_mesh", GrowMesh.Result(), 2, later))
+    node.early = 1
+    wait_for(run_client._compute.service_is_ready, "the analysis")
+    (estimate,) = run_client.mfpt("m", 0.0, [0.02])
+    assert estimate.mfpt == 7.0
+    assert node.questions.count(1) == 2
 
 
 def test_a_study_survives_lost_answers(graph, run_client, later):

@@ -20,6 +20,7 @@ from test_resume import Gate, Gated
 from biped_mfpt_ros.cli import main
 from biped_mfpt_ros.cli.output import json_text
 from biped_mfpt_ros.cli.parser import make_parser
+from biped_mfpt_ros.cli.pipeline import Pipeline
 from biped_mfpt_ros.cli.processes import Processes, Stopped
 from biped_mfpt_ros.control.controller import controller, controller_names
 from biped_mfpt_ros.gait.monte_carlo import monte_carlo
@@ -768,6 +769,19 @@ class TestRun:
         assert [row["mfpt"] for row in mesh["estimates"]] == [
             row["mfpt"] for row in alone["estimates"]
         ]
+        # What tells a run that its bag has all of it.
+        pipeline = Pipeline(None, None, result["namespace"])
+        (tmp_path / "run" / "growing").mkdir()
+        data = (tmp_path / "run" / "bag" / "bag_0.mcap").read_bytes()
+        (tmp_path / "run" / "growing" / "growing_0.mcap").write_bytes(data[:-8])
+        for bag, mesh_id, estimates, there in (
+            ("growing", result["mesh_id"], 2, True),
+            ("growing", result["mesh_id"], 3, False),
+            ("growing", "another", 2, False),
+            ("none", result["mesh_id"], 0, False),
+        ):
+            pipeline._bag = tmp_path / "run" / bag
+            assert pipeline._recorded(mesh_id, estimates) == there
         assert main(["inspect", str(tmp_path / "run")]) == 0
         assert repr(mesh["estimates"][0]["mfpt"]) in capsys.readouterr().out
 

@@ -28,6 +28,8 @@ from biped_mfpt_ros.nodes.spin import security_explained
 
 _Self = TypeVar("_Self", bound="Client")  # typing has Self from Python 3.11 on
 _POLL = 0.05  # s
+_PUBLISHED = 10.0  # s, for the analysis to publish an MFPT before it is asked
+_ON_ITS_WAY = 120.0  # s, for the last messages of a mesh to come to the analysis
 # What a recorder has to hear of a run: it finds each of them by itself, some tenths of a second
 # after its publisher, and a small mesh is grown and solved in less.
 RECORDED = ("mesh/info", "mesh/states", "mesh/transitions", "mesh/progress", "mfpt")
@@ -177,7 +179,7 @@ class Client:
         while not condition():
             if time.monotonic() > deadline:
                 raise WaitedInVain(f"waited {timeout:g} s for {what}")
-            self._spin()
+            self.spin()
 
     def grow_mesh(
         self, settings: MeshSettings, feedback: Callable[[MeshProgressMsg], object]
@@ -205,6 +207,19 @@ class Client:
             raise CommandError(f"the mesh failed: {result.message}")
         return result
 
+    def mfpt(
+        self, mesh_id: str, mu_s: float, sigma_s: Sequence[float], correlation: float = 0.0
+    ) -> list[MfptEstimate]:
+        """The MFPT of a mesh as published, or else by asking; AnalysisFailed if in vain.
+
+        Nothing is published where a chain cannot be solved. Where solving takes long, the answer
+        comes after what is published.
+        """
+        try:
+            return self.published_mfpt(mesh_id, mu_s, sigma_s, _PUBLISHED, correlation)
+        except WaitedInVain:
+            return self.compute_mfpt(mesh_id, mu_s, sigma_s, correlation)
+
     def published_mfpt(
         self,
         mesh_id: str,
@@ -231,15 +246,26 @@ class Client:
         self, mesh_id: str, mu_s: float, sigma_s: Sequence[float], correlation: float = 0.0
     ) -> list[MfptEstimate]:
         """Ask the analysis for the MFPT of a mesh at any ``sigma_s``; AnalysisFailed if in vain."""
-        return self.answer(self.ask_mfpt(mesh_id, mu_s, sigma_s, correlation))
+        # A chain may cost much, so that is asked for once, when the analysis has answered what
+        # costs nothing: then it has found this client.
+        greeting = ComputeMfpt.Request(client=self._name)
+        self._result(Answer(lambda: self._compute.call_async(greeting)))
+        deadline = time.monotonic() + _ON_ITS_WAY
+        while True:
+            try:
+                return self.answer(self.ask_mfpt(mesh_id, mu_s, sigma_s, correlation))
+            except AnalysisFailed as error:
+                if "mesh_id" not in str(error) or time.monotonic() > deadline:
+                    raise
+            self.spin()
 
     def ask_mfpt(
         self, mesh_id: str, mu_s: float, sigma_s: Sequence[float], correlation: float = 0.0
     ) -> Future:
         """Ask as `compute_mfpt` does, without waiting for the `answer`.
 
-        It may cost much, so it is asked once: an analysis of which an estimate has come has found
-        this client, and loses no answer.
+        It may cost much, so it is asked once: an analysis of which an estimate or an answer has
+        come has found this client, and loses no answer.
         """
         return self._compute.call_async(
             ComputeMfpt.Request(
@@ -271,9 +297,10 @@ class Client:
     def _result(self, answer: Answer | Future) -> Any:
         """An answer, when it has come."""
         while not answer.done():
-            self._spin()
+            self.spin()
         return answer.result()
 
-    def _spin(self) -> None:
-        self._executor.spin_once(timeout_sec=_POLL)
+    def spin(self, seconds: float = _POLL) -> None:
+        """Take what comes within a time, s, and see to the nodes."""
+        self._executor.spin_once(timeout_sec=seconds)
         self._watch()

@@ -10,7 +10,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -54,13 +54,14 @@ if TYPE_CHECKING:  # ROS need not be there
     from biped_mfpt_ros.nodes.messages import MeshSettings
 
 START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
-RESULT_TIMEOUT = 120.0  # s, for the analysis to solve the chain
+RESULT_TIMEOUT = 120.0  # s, for what the analysis has published to come
 _MOST_SWINGS = 100_000  # of a Monte Carlo: half a minute or so
 _MOST_MESHERS = 4  # started in a run: where one after the other is killed, there is a reason
-_MATCHED_WITHIN = 2.0
+_MATCHED_WITHIN = 15.0
 """s from when all nodes are there. A publisher may learn later than we do that the recorder hears
-it, tenths of a second on a busy machine; what it published before it sends then, if it still runs:
-a mesh of some states was grown and solved, and the nodes stopped, before that."""
+it, seconds on a busy machine; what it published before it sends then, if it still runs: a mesh of
+some states was grown and solved, and the nodes stopped, before that."""
+_LOOK = 0.1  # s, between two looks into a bag that is being recorded
 _CURVE_POINTS = 40
 _PICTURE_STEPS = 6
 
@@ -224,6 +225,7 @@ class Pipeline:
         self._meshers = 0
         self._mesher_parameters: dict[str, Any] = {}
         self._survives = False
+        self._bag = Path()
 
     def record(self, bag: Path, *, on_error: str = "stop") -> Child:
         """Start a recorder.
@@ -232,6 +234,7 @@ class Pipeline:
         written.
         """
         # It is stopped last, so that it hears what the others say to the end.
+        self._bag = bag
         text = quoted(str(bag.absolute()))
         return self._node("recorder", "recorder", last=True, bag=text, on_error=on_error)
 
@@ -318,16 +321,14 @@ class Pipeline:
                     name = self._start_mesher()
                     client.wait(partial(client.reaches, name), START_TIMEOUT, name)
             self._progress.show("waiting for the analysis")
-            estimates = client.published_mfpt(
-                grown.mesh_id, mean, list(sigmas), RESULT_TIMEOUT, correlation
-            )
+            estimates = client.mfpt(grown.mesh_id, mean, list(sigmas), correlation)
             low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)
             curve = client.compute_mfpt(
                 grown.mesh_id, mean, list(np.linspace(low, high, _CURVE_POINTS)), correlation
             )
-            if time.monotonic() < all_there:
-                self._progress.show("giving the recorder time to hear of everything")
-                client.wait(lambda: time.monotonic() >= all_there, RESULT_TIMEOUT, "the recorder")
+            self._progress.show("waiting for the recorder")
+            while time.monotonic() < all_there and not self._recorded(grown.mesh_id, len(sigmas)):
+                client.spin(_LOOK)
             return {
                 "mesh_id": grown.mesh_id,
                 "threshold": settings.threshold,
@@ -345,6 +346,21 @@ class Pipeline:
                 ],
                 "curve": [{"sigma_s": e.sigma_s, "mfpt": e.mfpt} for e in curve],
             }
+
+    def _recorded(self, mesh_id: str, estimates: int) -> bool:
+        """Whether the recorder has heard all of a mesh, and so many estimates of its MFPT."""
+        from biped_mfpt_ros.bag import Bag, BagError
+        from biped_mfpt_ros.bag.meshes import recorded_meshes
+
+        complete: set[str] = set()
+        counts: dict[str, int] = {}
+        with suppress(BagError):  # it has no end yet
+            bag = Bag(self._bag, unfinished=True)
+            try:
+                complete.update(found.mesh_id for found in recorded_meshes(bag) if found.mesh)
+            finally:
+                counts = {name: topic.count for name, topic in bag.topics.items()}
+        return mesh_id in complete and counts.get(f"{self.namespace}/mfpt", 0) >= estimates
 
     def up(self, client: Client) -> bool:
         """Whether all nodes are there."""

@@ -47,7 +47,6 @@ if TYPE_CHECKING:  # ROS need not be there
     from biped_mfpt_ros.nodes.recorder import Recorder
 
 _MOST_STATES = 200_000
-_RETRY = 0.05  # s
 _POLL = 0.2  # s
 _PATIENCE = 10.0  # s
 _MOST_TRIES = 3  # for a mesh to be in its bag
@@ -418,18 +417,12 @@ def _estimate(study: _Study, job: Job, client: Client, mesh_id: str, sigma_s: fl
     """MFPT of a mesh at one sigma; None where the chain cannot be solved."""
     from biped_mfpt_ros.cli.client import AnalysisFailed
 
-    deadline = time.monotonic() + RESULT_TIMEOUT
-    while True:
-        try:
-            return client.compute_mfpt(mesh_id, 0.0, [sigma_s])[0]
-        except AnalysisFailed as error:
-            # The last messages of the mesh may still be on their way to the analysis.
-            if "mesh_id" in str(error) and time.monotonic() < deadline:
-                time.sleep(_RETRY)
-                continue
-            degrees = math.degrees(sigma_s)
-            study.progress.say(f"{job.title}: no MFPT at {degrees:g} degrees: {error}")
-            return None
+    try:
+        return client.compute_mfpt(mesh_id, 0.0, [sigma_s])[0]
+    except AnalysisFailed as error:
+        degrees = math.degrees(sigma_s)
+        study.progress.say(f"{job.title}: no MFPT at {degrees:g} degrees: {error}")
+        return None
 
 
 # The report -------------------------------------------------------------------------------------
