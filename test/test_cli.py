@@ -321,7 +321,7 @@ def test_second_interrupt_does_not_wait_for_threads():
         "from biped_mfpt_ros.gait import monte_carlo\n"
         "walk = monte_carlo._walk\n"
         "def tell(*args):\n"
-        "    print('walking', flush=True)\n"
+        "    print('walking\\n', end='', flush=True)\n"  # in one piece, whoever prints beside
         "    walk(*args)\n"
         "monte_carlo._walk = tell\n"
         "sys.exit(cli.main())\n"
