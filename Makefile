@@ -1,4 +1,4 @@
-# What this needs: Python 3.10 to 3.14 with venv and headers, a C++ compiler, CMake, make. No ROS 2.
+# What this needs: Python 3.10 to 3.14 with venv and headers, a C++ compiler, make. No ROS 2.
 PYTHON ?= python3
 BIN := .venv/bin
 ARGS ?=
@@ -11,7 +11,7 @@ unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_P
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
 
-setup: ## set up .venv: ROS 2 wheels, messages, this package (first time about 90 s)
+setup: ## set up .venv: ROS 2 wheels, messages, this package (first time one to two minutes)
 	@PYTHON='$(PYTHON)' tools/setup
 
 run: setup ## walk, mesh, compute the MFPT over ROS 2, record it; ARGS='--help' lists the options
@@ -33,6 +33,6 @@ bench: setup ## time step map, mesh and chain; ARGS='--short' or ARGS='--json'
 soak: setup ## break things many times and count what came of it; ARGS='--short', '--only fuzz' or '--json'
 	@$(BIN)/python -m biped_mfpt_ros.soak $(ARGS)
 
-clean: ## remove all that the other targets made, .venv included
+clean: ## remove .venv and all that was built or cached here; results in runs/ stay
 	rm -rf .venv build .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
