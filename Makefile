@@ -17,7 +17,7 @@ setup: ## set up .venv: ROS 2 wheels, messages, this package (first time one to 
 run: setup ## walk, mesh, compute the MFPT over ROS 2, record it; ARGS='--help' lists the options
 	@$(BIN)/biped-mfpt run $(ARGS)
 
-reproduce: setup ## the tables and figures of the paper (2 to 3 min); ARGS='--quick' takes half a minute
+reproduce: setup ## the tables and figures of the paper (2 min); ARGS='--quick' takes half a minute
 	@$(BIN)/biped-mfpt reproduce $(ARGS)
 
 test: setup ## run the tests but the slow ones; ARGS='-m slow' runs those

@@ -18,9 +18,9 @@ NODES = ("simulator", "mesher", "analysis", "recorder", "optimiser")
 _DESCRIPTION = """\
 How many steps does a walking robot take on rough ground before it falls?
 
-biped-mfpt walks the five-link biped RABBIT on slopes drawn from a normal distribution, meshes the
-states that it can reach, makes a Markov chain of them and computes the mean first-passage time
-(MFPT) to a fall, in steps.
+biped-mfpt walks a five-link biped, RABBIT or your own, on slopes drawn from a normal distribution,
+meshes the states that it can reach, makes a Markov chain of them and computes the mean
+first-passage time (MFPT) to a fall, in steps.
 """
 
 _EPILOG = """\

@@ -81,6 +81,9 @@ def add_mfpt(add: Add) -> None:
 The mesh does not depend on the distribution of the slopes, so that any number of standard
 deviations costs one mesh. In this process, without ROS.
 
+A coarse mesh errs: make --threshold and --slope-step smaller until the number settles, and compare
+with `biped-mfpt monte-carlo` where the robot falls soon enough.
+
 examples:
   biped-mfpt mfpt --controller hzd/mfpt --sigma 1 2 --slope-step 0.5 --threshold 0.3
   biped-mfpt mfpt --controller hzd/cot --sigma 0.5 1 1.5 2 --mean -1 --json

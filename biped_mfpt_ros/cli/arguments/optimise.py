@@ -60,9 +60,9 @@ examples:
         "--confirm",
         metavar="STUDY",
         help="no search: score the front of another study of the store again, that is, its "
-        "confirmed trials that no other one beats in MFPT and cost of transport. --mesh, "
-        "--slope-limit, --check-walks, --trial-seconds, --tolerance and --seed are as given, all "
-        "else is as in STUDY",
+        "confirmed trials that no other one beats in MFPT, cost of transport and every other "
+        "objective. --mesh, --slope-limit, --check-walks, --trial-seconds, --tolerance and --seed "
+        "are as given, all else is as in STUDY",
     )
     optimise.add_argument(
         "--searcher",
@@ -152,8 +152,8 @@ examples:
         default=0,
         metavar="N",
         help="runs of cma-es from the same start, each with random numbers of its own; they take "
-        "turns, and the worse half ends again and again (default: 4; 1 is better for less than "
-        "3000 trials)",
+        "turns, and the worse half ends again and again (default: 4; 1 is better for short "
+        "searches, see docs/optimise.md)",
     )
     optimise.add_argument(
         "--trials",
