@@ -729,9 +729,9 @@ def wait_until(condition, run, what, timeout=PATIENCE):
         time.sleep(0.05)
 
 
-# A mesh that takes long enough to be interrupted.
+# A mesh that is never complete.
 LONG = (
-    "--slope-step", "0.25", "--threshold", "1e-6", "--max-states", "1000000",
+    "--slope-step", "0.25", "--threshold", "1e-6", "--max-states", "100000000",
     "--workers", "1", "--output", "run",
 )  # fmt: skip
 

@@ -13,6 +13,7 @@ from biped_mfpt_msgs.msg import MeshInfo, MeshProgress, MeshStates, MeshTransiti
 from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from ros_graph import PATIENCE, Client, cancel, ros_graph, wait_for
 
 from biped_mfpt_ros.chain.markov import metastability
@@ -28,7 +29,7 @@ from biped_mfpt_ros.nodes.mesher import Mesher
 from biped_mfpt_ros.nodes.meshes import new_mesh_id
 from biped_mfpt_ros.nodes.messages import MeshSettings, packed
 from biped_mfpt_ros.nodes.parameters import Declared, NodeParameters, parameter
-from biped_mfpt_ros.nodes.qos import PROGRESS, RESULTS
+from biped_mfpt_ros.nodes.qos import RESULTS
 from biped_mfpt_ros.nodes.simulator import Simulator
 from biped_mfpt_ros.walker.robot import WalkerModel, rabbit
 from biped_mfpt_ros.walker.terrain import slope_set
@@ -260,7 +261,10 @@ def test_mesh_from_the_limit_cycle_is_the_one_grown_here(graph, tester, cycle_st
     graph.start(Simulator)
     graph.start(Mesher, progress_period=0.05)
     feedback, topic = [], []
-    tester.create_subscription(MeshProgress, "mesh/progress", topic.append, PROGRESS)
+    # Deep enough to miss nothing, however slow this process is.
+    tester.create_subscription(
+        MeshProgress, "mesh/progress", topic.append, QoSProfile(depth=10_000)
+    )
     wanted = settings(clustered=clustered)
     status, result = tester.grow(wanted, feedback.append)
     assert status == GoalStatus.STATUS_SUCCEEDED
@@ -273,8 +277,17 @@ def test_mesh_from_the_limit_cycle_is_the_one_grown_here(graph, tester, cycle_st
     assert result.swings == len(mesh.states) - 1
     assert 0.0 < result.step_map_seconds < result.seconds
     assert tester.meshes[result.mesh_id].step_map == STEP_MAP
-    wait_for(lambda: feedback and topic, "progress")
-    for last in (feedback[-1], topic[-1]):
+
+    def last_of(progress):
+        # The result may come before the last of it.
+        done = (result.swings, 0)
+        wait_for(
+            lambda: progress and (progress[-1].swings, progress[-1].chunks_in_flight) == done,
+            "the last progress",
+        )
+        return progress[-1]
+
+    for last in (last_of(feedback), last_of(topic)):
         assert (last.mesh_id, last.states) == (result.mesh_id, result.states)
         assert (last.swings, last.frontier, last.chunks_in_flight) == (result.swings, 0, 0)
         assert last.simulators == 1

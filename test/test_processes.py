@@ -101,7 +101,7 @@ def test_pipeline_of_processes(graph, client):
             assert status == GoalStatus.STATUS_SUCCEEDED, result.message
             published.append(result.mesh_id)
             assert_same_mesh(client.mesh(result.mesh_id), here)
-            return seen[-1].simulators == count
+            return seen and seen[-1].simulators == count
 
         wait_for(grown_by_all, f"a mesh grown by {count} simulators")
     wait_for(lambda: len(estimates) == len(published), "an estimate for every mesh")
