@@ -67,8 +67,8 @@ class Forgetful(Node):
             return result
 
         self._action = ActionServer(self, kind, name, execute)
-        for what in ("_execute_goal_request", "_execute_get_result_request"):
-            self._lose_first(what, lost)
+        for what in ("_goal_request", "_get_result_request", "_cancel_request"):
+            self._lose_first(f"_execute{what}", lost)
         self._lost_questions = lost
         # What the analysis is known by.
         self.create_publisher(MfptEstimate, "mfpt", RESULTS)
@@ -207,6 +207,15 @@ def test_a_run_survives_lost_answers(graph, run_client, later):
     settings = MeshSettings(BASE, WalkerModel(), slope_set(1.0), 1.0)
     assert run_client.grow_mesh(settings, lambda progress: None).mesh_id == "grown"
     assert node.executed == 1
+
+
+def test_a_client_is_not_found_before_it_is_answered(graph, run_client, later):
+    node = graph.start(lambda: Forgetful(GrowMesh, "grow_mesh", GrowMesh.Result(), 2, later))
+    lost = []
+    node._on_loss = lambda: (lost.append(None), later())
+    run_client.wait_until_found()
+    assert node.questions == [0, 0, 0]
+    assert len(lost) == 4
 
 
 def test_a_run_asks_for_an_mfpt_that_is_not_published(graph, run_client, later, monkeypatch):

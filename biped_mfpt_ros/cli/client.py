@@ -13,11 +13,13 @@ from biped_mfpt_msgs.action import GrowMesh
 from biped_mfpt_msgs.msg import MeshProgress as MeshProgressMsg
 from biped_mfpt_msgs.msg import MfptEstimate
 from biped_mfpt_msgs.srv import ComputeMfpt, SimulateSteps
+from rclpy.action.client import ClientGoalHandle
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from unique_identifier_msgs.msg import UUID
 
 from biped_mfpt_ros.cli import CommandError, leaving
 from biped_mfpt_ros.nodes.answers import ActionClient, Answer, accepted
@@ -172,6 +174,23 @@ class Client:
             )
             for topic in topics
         )
+
+    def wait_until_found(self) -> None:
+        """Wait until mesher and analysis have found all that this process has on the graph by now.
+
+        A node finds it in the order in which it was made, so that it has found all of it when it
+        answers a client that was made last.
+        """
+        compute = self._node.create_client(ComputeMfpt, "compute_mfpt", qos_profile=REQUESTS)
+        grow = ActionClient(self._node, GrowMesh, "grow_mesh")
+        none = ClientGoalHandle(grow, UUID(uuid=[1] * 16), GrowMesh.Impl.SendGoalService.Response())
+        while not (compute.service_is_ready() and grow.server_is_ready()):
+            self.spin()
+        greeting = ComputeMfpt.Request(client=self._name)
+        for ask in (lambda: compute.call_async(greeting), none.cancel_goal_async):
+            self._result(Answer(ask))
+        self._node.destroy_client(compute)
+        grow.destroy()
 
     def wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
         """Wait until a condition holds; WaitedInVain after ``timeout`` seconds."""

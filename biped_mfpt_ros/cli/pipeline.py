@@ -53,7 +53,8 @@ if TYPE_CHECKING:  # ROS need not be there
     from biped_mfpt_ros.cli.client import Client
     from biped_mfpt_ros.nodes.messages import MeshSettings
 
-START_TIMEOUT = 60.0  # s, for nodes that import much on a busy machine
+START_TIMEOUT = 300.0
+"""s, for nodes that import much on a busy machine. One that ends meanwhile is noticed at once."""
 RESULT_TIMEOUT = 120.0  # s, for what the analysis has published to come
 _MOST_SWINGS = 100_000  # of a Monte Carlo: half a minute or so
 _MOST_MESHERS = 4  # started in a run: where one after the other is killed, there is a reason

@@ -284,6 +284,8 @@ def _meshes(study: _Study, jobs: Sequence[Job], pipeline: Pipeline, directory: P
             client.wait(
                 partial(client.listens, name, RECORDED), START_TIMEOUT, f"{name} to come up"
             )
+            if tries.total() == 1:
+                client.wait_until_found()
             result = _grow(study, job, client)
             heard = _wait_for_estimates(study, job, client, result["mesh_id"], recorder)
             recorder.close()
