@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from processors import printed_on_two
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly, BSpline
 
@@ -338,21 +336,6 @@ for name in controller_names():
 
 def test_kernels_read_the_same_bits_on_other_processors():
     """Simulators of one mesh may run on several; BLAS, numpy and the C library look which."""
-    features = "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-    older = {
-        "OPENBLAS_CORETYPE": "Nehalem",
-        "NPY_DISABLE_CPU_FEATURES": features,
-        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4",
-    }
-    here, there = (
-        subprocess.run(
-            [sys.executable, "-c", _PACKED],
-            env={**os.environ, **environment},
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout.splitlines()
-        for environment in ({}, older)
-    )
-    assert len(here) == 1 + len(controller_names())
+    here, there = printed_on_two(_PACKED)
+    assert len(here.splitlines()) == 1 + len(controller_names())
     assert here == there

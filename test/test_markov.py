@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import mpmath
 import numpy as np
 import pytest
 from hypothesis import example, given, reject, settings
 from hypothesis import strategies as st
+from processors import printed_on_two
 from scipy.sparse.linalg import eigs
 
 from biped_mfpt_ros.chain import iteration, markov
@@ -471,6 +473,34 @@ def test_one_result_has_the_same_bits_as_many_with_any_number_of_threads():
             assert_same_bits(one, other)
 
 
+_DIGITS = """
+import sys
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from test_markov import lifted, walker
+from biped_mfpt_ros.chain import aggregation, markov
+rows, slopes = walker(12, 0.8)
+aggregation.GROUPS = 200  # of 225 and 25 states
+for steps in (markov._STEPS, 0):
+    markov._STEPS = steps
+    for copies in (1, 9):
+        for sigma in np.radians([0.7, 1.3, 2.1, 3.0]):
+            for rho in (0.0, 0.6):
+                p = markov.conditional_probabilities(slopes, 0.001, sigma, rho)
+                targets, outcomes = lifted(rows, len(slopes), copies)
+                found = markov.solve_chain(targets, outcomes, p[40])  # flat
+                print(p.tobytes().hex(), found.mfpt, found.failure_shares)
+                print(found.distribution.tobytes().hex(), found.mfpt_from_state.tobytes().hex())
+"""
+
+
+def test_bits_do_not_depend_on_the_processor():
+    # What a bag says is computed again anywhere.
+    here, older = printed_on_two(_DIGITS, str(Path(__file__).parent))
+    assert len(here.splitlines()) == 64
+    assert here == older
+
+
 def test_columns_that_settle_at_different_times_do_not_mix():
     # One survives no step, one no second; one never falls; the others are done at their own time.
     rows = [[2, 0, 0, 1], [3, 0, 1, 1], [0, 0, 1, 2]]
@@ -642,6 +672,15 @@ def test_slope_probabilities_have_the_moments_of_the_distribution(ratio, error):
     assert p.sum() == pytest.approx(1.0, abs=1e-15)
     assert p @ slopes == pytest.approx(mu, abs=error * sigma)
     assert p @ (slopes - mu) ** 2 == pytest.approx(sigma**2, rel=error)
+
+
+def test_slope_probabilities_below_any_number_are_zero():
+    # e^-702 is 1e-305, e^-720 is 1e-313, where digits are missing.
+    slopes = [0.0, *(0.01 * math.sqrt(2.0 * exponent) for exponent in (702.0, 720.0)), 0.7]
+    p = slope_probabilities(slopes, 0.0, 0.01)
+    ratio = mpmath.mpf(slopes[1]) / mpmath.mpf(0.01)
+    assert relative(p[1], mpmath.exp(-(ratio**2) / 2)) < 1e-12
+    assert p.tolist() == [1.0, p[1], 0.0, 0.0]
 
 
 def test_narrow_density_falls_on_the_nearest_slope():

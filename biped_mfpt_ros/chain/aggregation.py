@@ -142,6 +142,15 @@ def _pieces(q: csr_array) -> np.ndarray:
     return np.where(kept, np.cumsum(kept), 0)[root]
 
 
+def _logarithm(x: np.ndarray) -> np.ndarray:
+    """The binary logarithm at powers of 2, and straight in between: numpy's depends on the machine.
+
+    What it is for are levels, which it leaves in order.
+    """
+    mantissa, exponent = np.frexp(x)
+    return 2.0 * mantissa + exponent
+
+
 def _levels(change: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Number the levels of a change, from the least to the greatest of those that count."""
     least, greatest = change[counts].min(), change[counts].max()
@@ -265,7 +274,7 @@ def _balanced(
         last = np.maximum(solved, _SMALLEST)
         steps = min(_STEPS << k // _ROUNDS_ALIKE, max(_STEPS, _WORK // (2 * q.nnz)))
         x = _step(backward, last, source, steps)
-        levels = [_levels(np.log(x / last), x > UNDERFLOW), *levels[: _ROUNDS_KEPT - 1]]
+        levels = [_levels(_logarithm(x / last), x > UNDERFLOW), *levels[: _ROUNDS_KEPT - 1]]
         groups = _intersected([parts, levels[0], pieces, *levels[1:]])
         solved = _share_out(q, falls, x, groups, tolerance, among, source)
         if solved is None:
@@ -273,7 +282,7 @@ def _balanced(
         # All weights are waited for, as a part may seem to matter little until its shape is known.
         known = solved > UNDERFLOW
         changes.append(float((np.abs(solved - last)[known] / solved[known]).max()))
-        escapes.append(float(solved @ falls))
+        escapes.append(float((solved * falls).sum()))
         # What all further rounds would change is about a geometric series.
         rate = min(changes[k] / changes[k - 1], 0.9) if k > 0 and changes[k - 1] > 0.0 else 0.9
         if changes[k] <= (1.0 - rate) * tolerance:
@@ -321,7 +330,7 @@ def metastable_distribution(q: csr_array, falls: np.ndarray, tolerance: float) -
         if x is None:
             return None
         vectors[states] = x
-        rates[c], stays[c] = float(x @ leaving[states]), float((x @ own).sum())
+        rates[c], stays[c] = (x * leaving[states]).sum(), (x @ own).sum()
     best = int(np.lexsort((-stays, rates))[0])
     while True:
         order = breadth_first_order(q, np.argmax(labels == best), return_predecessors=False)

@@ -57,6 +57,9 @@ _OFTEN = 0.1
 _WORTH_THREADS = 1_000_000  # transitions times columns
 # Largest ratio of the parts of a sum to the sum itself: three of sixteen digits lost.
 _CANCELLATION = 1e3
+_LOWEST_EXPONENT = -708.0  # e^-708 is 3e-308
+# ln 2 in two parts, the first with 33 digits of 53 in use.
+_LN2_FIRST, _LN2_REST = float.fromhex("0x1.62e42feep-1"), float.fromhex("0x1.a39ef35793c76p-33")
 
 
 class ChainError(RuntimeError):
@@ -158,6 +161,26 @@ def _check_distribution(slopes: ArrayLike, mu_s: float, sigma_s: float) -> np.nd
     return slopes
 
 
+@kernel
+def _exponentials(x, out):
+    """`out` = e^x for x <= 0, 0 below the smallest number with all its digits.
+
+    The same bits on every processor, unlike numpy's and the C library's.
+    """
+    for i in range(x.shape[0]):
+        if x[i] < _LOWEST_EXPONENT:
+            out[i] = 0.0
+            continue
+        doublings = np.floor(x[i] / math.log(2.0) + 0.5)
+        # The product with the first part is exact.
+        r = (x[i] - doublings * _LN2_FIRST) - doublings * _LN2_REST
+        series = 1.0
+        # Of 0.35^14 / 14! less than 1e-17 is left.
+        for k in range(13, 0, -1):
+            series = 1.0 + series * r / k
+        out[i] = math.ldexp(series, int(doublings))
+
+
 def _normal(slopes: np.ndarray, mean: float | np.ndarray, sigma: float) -> np.ndarray:
     """The normal density on the slopes, scaled to sum 1 along the last axis."""
     # Relative to the likeliest slope, so that a narrow density between slopes does not vanish.
@@ -165,7 +188,8 @@ def _normal(slopes: np.ndarray, mean: float | np.ndarray, sigma: float) -> np.nd
     least = distances.min(axis=-1, keepdims=True)
     with np.errstate(over="ignore"):
         exponents = 0.5 * ((distances - least) * (distances + least)) / sigma / sigma
-    weights = np.exp(-exponents)
+    weights = np.empty(exponents.shape)
+    _exponentials(-exponents.reshape(-1), weights.reshape(-1))
     return weights / weights.sum(axis=-1, keepdims=True)
 
 
@@ -375,7 +399,8 @@ def _iterated_times(
             return None
         found = settled.vectors[:, 0]
         # 0 where nothing settles at all, and tiny where psi is that of states out of x_2's reach.
-        overlap = float(phi @ found)
+        # Not by BLAS here and below, whose order of operations depends on the machine.
+        overlap = float((phi * found).sum())
         if overlap < iteration.UNDERFLOW:
             return _iterated_times(targets, offsets, probabilities, among, phi, 0.0)
         psi = found / overlap
@@ -401,7 +426,7 @@ def _iterated_times(
             series += 0.5 * rest
             rest = 0.5 * (rest + out)
         # phi rest = 0 but for rounding, which would stay for ever.
-        rest -= psi * (phi @ rest)
+        rest -= psi * (phi * rest).sum()
     return None
 
 

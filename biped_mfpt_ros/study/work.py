@@ -100,7 +100,7 @@ def mean_walk(mesh: Mesh, sigma_s: float) -> float:
     times = metastability(mesh, 0.0, sigma_s).mfpt_from_state
     probabilities = slope_probabilities(mesh.slopes, 0.0, sigma_s)
     second = mesh.targets[1]  # where the first step leads
-    return float(probabilities @ times[second] / probabilities[second > 0].sum())
+    return float((probabilities * times[second]).sum() / probabilities[second > 0].sum())
 
 
 def tolerance(job: Job, state: list[float]) -> dict[str, Any]:
