@@ -12,6 +12,7 @@ import os
 import random
 import resource
 import shutil
+import struct
 import tempfile
 from functools import cache
 from pathlib import Path
@@ -583,6 +584,36 @@ def test_definition_that_does_not_fit_its_hash_is_refused(tmp_path):
         list(Bag(tmp_path / "bag").messages())
 
 
+def test_two_definitions_of_a_type_are_refused(tmp_path):
+    definition = message_definition("biped_mfpt_msgs/msg/MeshStates")
+    with BagWriter(tmp_path / "bag") as writer:
+        for i, text in enumerate((definition, f"{definition}\n# again")):
+            writer.add_topic(f"/states_{i}", "biped_mfpt_msgs/msg/MeshStates", text)
+            writer.write(f"/states_{i}", states_message(i), i, i)
+    messages = Bag(tmp_path / "bag").messages()
+    assert next(messages).message.sequence == 0
+    with pytest.raises(BagError, match="two different definitions of biped_mfpt_msgs"):
+        next(messages)
+
+
+def test_chunk_of_another_size_than_it_says_or_beyond_the_limit_is_refused(tmp_path, monkeypatch):
+    write_states(tmp_path / "bag", 9, every=9)
+    with (tmp_path / "bag" / "bag_0.mcap").open("rb") as file:
+        records = StreamReader(file, emit_chunks=True).records
+        chunk = next(record for record in records if isinstance(record, Chunk))
+    size, sizes = chunk.uncompressed_size, struct.Struct("<QI")
+    monkeypatch.setattr("biped_mfpt_ros.bag.reader._CHUNK_LIMIT", size)
+    assert len(list(Bag(tmp_path / "bag").raw_messages())) == 9
+    monkeypatch.setattr("biped_mfpt_ros.bag.reader._CHUNK_LIMIT", size - 1)
+    with pytest.raises(BagError, match=f"is damaged .*a chunk of {size} bytes"):
+        list(Bag(tmp_path / "bag").raw_messages())
+    monkeypatch.undo()
+    says = sizes.pack(size + 1, chunk.uncompressed_crc)
+    replace_bytes(tmp_path / "bag", sizes.pack(size, chunk.uncompressed_crc), says)
+    with pytest.raises(BagError, match=f"is damaged .*a chunk of {size} bytes"):
+        list(Bag(tmp_path / "bag").raw_messages())
+
+
 def test_message_without_fields_is_read(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/tick", "test_msgs/msg/Empty", "")
@@ -613,6 +644,15 @@ def test_split_bag_is_read_as_one(tmp_path):
 
     rewrite(bag, name_both)
     assert [m.message.sequence for m in Bag(bag).messages()] == [*range(9), *range(3)]
+
+
+def test_files_of_a_bag_without_metadata_are_in_the_order_of_their_numbers(tmp_path):
+    (tmp_path / "bag").mkdir()
+    for i in (10, 2, 0, 1, 9):
+        write_states(tmp_path / f"b{i}", i + 1)
+        (tmp_path / f"b{i}" / f"b{i}_0.mcap").rename(tmp_path / "bag" / f"bag_{i}.mcap")
+    files = Bag(tmp_path / "bag", unfinished=True).files
+    assert [file.name for file in files] == [f"bag_{i}.mcap" for i in (0, 1, 2, 9, 10)]
 
 
 # Sequence numbers

@@ -172,8 +172,45 @@ def test_runs_of_cma_es_differ_and_the_first_is_that_of_a_search_of_one():
     assert alone[0] == np.array([cma.ask() for _ in range(4)]).tobytes()
 
 
+def test_a_run_of_cma_es_that_has_converged_is_restarted_from_its_best_with_twice_as_many():
+    searcher = make_searcher("cma-es", BOUNDS, seed=3, step=0.1, population=6)
+    best, size = np.zeros(4), 6
+    for _ in range(1000):
+        vectors = searcher.ask()
+        if len(vectors) > size:
+            break
+        assert len(vectors) in (1, size)
+        searcher.tell(vectors, [told(x) for x in vectors])
+        best = min([best, *vectors], key=quadratic)
+    assert len(vectors) == 2 * size
+    assert np.abs(best - TARGET).max() < 1e-3
+    # Normal numbers with the first step: of 48 none is beyond six, and the start is 20 away.
+    assert np.abs(vectors - best).max() < 0.6
+
+
+def test_pattern_search_doubles_or_halves_its_mesh():
+    searcher = make_searcher("pattern", BOUNDS[:2], step=0.25)
+    searcher.tell(searcher.ask(), [Told(0.0, (), 0.0)])
+    centre, size, best = np.zeros(2), 0.25, 0.0
+    cross = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    for better in [*[True] * 5, False, True, *[False] * 100]:
+        asked = searcher.ask()
+        np.testing.assert_array_equal(asked, np.clip(centre + size * cross, -5.0, 5.0))
+        scores = [best] * 4  # as good is not better
+        if better:
+            scores[1:3] = best + 1.0, best + 2.0
+            centre, best = asked[2], best + 2.0
+        size *= 2.0 if better else 0.5
+        searcher.tell(asked, [Told(score, (), 0.0) for score in scores])
+        if searcher.done:
+            break
+    assert centre[0] == -5.0  # the mesh has come to the bound
+    assert size < 1e-4 * 0.25 <= 2.0 * size
+
+
 def test_nsga2_spreads_over_the_front():
     found, _ = searched("nsga2", 2000)
+    assert not found[1].any()  # the start takes part
     ends = min(map(quadratic, found)), min(np.abs(x).sum() for x in found)
     assert ends[0] < 0.05  # one end: the optimum of the first objective
     assert ends[1] == 0.0  # the other: the start is that of the second
