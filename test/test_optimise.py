@@ -214,6 +214,7 @@ def test_nsga2_spreads_over_the_front():
     ends = min(map(quadratic, found)), min(np.abs(x).sum() for x in found)
     assert ends[0] < 0.05  # one end: the optimum of the first objective
     assert ends[1] == 0.0  # the other: the start is that of the second
+    assert (found[-200:, 3] <= 4.5).mean() > 0.9  # within the constraint
 
 
 def test_nelder_mead_is_that_of_scipy():
