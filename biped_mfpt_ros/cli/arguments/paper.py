@@ -82,7 +82,8 @@ refreshed. Every combination of the given values is judged by Tables 2 and 4, Mo
 and has to fulfil what the paper claims: all controllers walk on flat ground; hzd/base falls down 1
 degree, and walks on the flat and down 9 with no torque late in a step. Which values serve best is
 told for one reading for all controllers, for one for each scheme, and so on, and how well the
-numbers determine them. Stopped and started again it goes on where it was.
+numbers determine them. It takes about an hour of a core; stopped and started again it goes on where
+it was.
 
 examples:
   biped-mfpt calibrate                                    # the study that the defaults come from
