@@ -57,9 +57,14 @@ class Publisher(Node):
         """Whether what is published from now on reaches the recorder."""
         return self._publishers_by_topic[topic]._publisher.get_subscription_count() > 0
 
-    def wait_until_received(self, topic):
-        """Wait until the recorder has acknowledged all messages."""
+    def wait_until_flushed(self, topic, bag, number=None):
+        """Wait until a bag has all messages of a topic, or so many."""
+        number = len(self.sent[f"/run/{topic}"]) if number is None else number
         wait_for(lambda: self.is_recorded(topic), "the recorder")
+        wait_for(lambda: flushed(bag)[f"/run/{topic}"] == number, f"{number} to be flushed")
+
+    def wait_until_received(self, topic):
+        """Wait until the recorder has acknowledged all messages, which it does every 3 s."""
         publisher = self._publishers_by_topic[topic]._publisher
         assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
 
@@ -210,7 +215,7 @@ def test_recorder_may_leave_out_what_was_before(graph, tmp_path, earlier):
     process = record(graph, bag, "-p", f"earlier:={str(earlier).lower()}")
     wait_for(lambda: publisher.is_recorded("mesh/info"), "the recorder")
     publisher.send("mesh/info", messages.MeshInfo(mesh_id="mine"))
-    publisher.wait_until_received("mesh/info")
+    publisher.wait_until_flushed("mesh/info", bag, 3 if earlier else 1)
     code, log = stop(process)
     assert code == 0, log
     recorded = [
@@ -230,11 +235,10 @@ def test_lost_messages_are_errors_in_the_log(graph, tmp_path):
     publisher.skip("mesh/info", 3)
     publisher.send("mesh/info", messages.MeshInfo())
     process = record(graph, tmp_path / "bag")
-    publisher.wait_until_received("mesh/info")
-    wait_for(lambda: flushed(tmp_path / "bag")["/run/mesh/info"] == 2, "two to be flushed")
+    publisher.wait_until_flushed("mesh/info", tmp_path / "bag")
     publisher.skip("mesh/info", 1)
     publisher.send("mesh/info", messages.MeshInfo())
-    wait_for(lambda: flushed(tmp_path / "bag")["/run/mesh/info"] == 3, "all to be flushed")
+    publisher.wait_until_flushed("mesh/info", tmp_path / "bag")
     code, log = stop(process, signal.SIGINT)
     assert code == 0
     assert "[ERROR]" in log
@@ -261,10 +265,10 @@ def test_killed_recorder_leaves_what_was_flushed(graph, tmp_path):
     publisher = graph.start(Publisher)
     publisher.send("mesh/states", messages.MeshStates(states=noise(0)))
     process = record(graph, bag)
-    publisher.wait_until_received("mesh/states")
+    publisher.wait_until_flushed("mesh/states", bag)
     for i in range(1, 60):
         publisher.send("mesh/states", messages.MeshStates(states=noise(i)))
-    wait_for(lambda: flushed(bag)["/run/mesh/states"] == 60, "all to be flushed")
+    publisher.wait_until_flushed("mesh/states", bag)
     for i in range(60, 80):
         publisher.send("mesh/states", messages.MeshStates(states=noise(i)))
     process.send_signal(signal.SIGKILL)
@@ -301,10 +305,10 @@ def test_stopped_in_full_swing_the_bag_is_whole(graph, tmp_path):
     publisher = graph.start(Publisher)
     publisher.send("mesh/states", messages.MeshStates())
     process = record(graph, bag, "-p", "flush_period:=0.01")
-    publisher.wait_until_received("mesh/states")
+    publisher.wait_until_flushed("mesh/states", bag)
     for i in range(300):
         publisher.send("mesh/states", messages.MeshStates(states=noise(i, 20)))
-    publisher.wait_until_received("mesh/states")
+    publisher.wait_until_flushed("mesh/states", bag)
     for i in range(100):
         publisher.send("mesh/states", messages.MeshStates(states=noise(i, 20)))
         if i == 50:
@@ -322,8 +326,7 @@ def test_full_disk_ends_the_recorder_with_a_clear_error(graph, tmp_path):
     publisher = graph.start(Publisher)
     publisher.send("mesh/states", messages.MeshStates())
     process = record(graph, bag, "-p", "flush_period:=0.05")
-    publisher.wait_until_received("mesh/states")
-    wait_for(lambda: flushed(bag)["/run/mesh/states"] == 1, "the first message")
+    publisher.wait_until_flushed("mesh/states", bag)
     # A limit on the size of its files fails a write in the same way as a full disk does.
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
     for i in range(60):
@@ -347,7 +350,7 @@ def test_on_a_full_disk_it_stops_or_goes_on_as_told(graph, tmp_path, on_error):
         publisher = graph.start(Publisher)
         publisher.send("mesh/states", messages.MeshStates())
         process = record(graph, bag, "-p", "flush_period:=0.05", "-p", f"on_error:={on_error}")
-        publisher.wait_until_received("mesh/states")
+        publisher.wait_until_flushed("mesh/states", bag)
         fit, number = 20, 150
         for i in range(1, number + 1):
             publisher.send("mesh/states", messages.MeshStates(states=noise(i)))
@@ -382,7 +385,7 @@ def test_a_restarted_recorder_catches_up(graph, tmp_path, when):
     first = record(graph, tmp_path / "first")
     for i in range(100):
         if i == 50:
-            publisher.wait_until_received("mesh/states")
+            publisher.wait_until_flushed("mesh/states", tmp_path / "first")
             first.send_signal(signal.SIGKILL)
             first.wait()
             if when == "early":
