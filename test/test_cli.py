@@ -563,10 +563,11 @@ class TestProcesses:
         assert child.process.returncode == -signal.SIGKILL
         assert child.ending() == "was killed by SIGKILL"
 
-    def test_the_last_one_has_longer(self, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("told", [None, PATIENCE])
+    def test_the_last_one_has_longer(self, tmp_path, monkeypatch, told):
         """A recorder that closes its bag on a busy machine."""
         monkeypatch.setattr("biped_mfpt_ros.cli.processes._GRACE", 0.1)
-        monkeypatch.setattr("biped_mfpt_ros.cli.processes._LAST_GRACE", PATIENCE)
+        monkeypatch.setattr("biped_mfpt_ros.cli.processes._LAST_GRACE", 0.1 if told else PATIENCE)
         slow = (
             "import signal, sys, time\n"
             "def end(*_):\n"
@@ -579,6 +580,7 @@ class TestProcesses:
         with Processes(tmp_path) as processes:
             last = processes.start("slow", [sys.executable, "-c", slow], last=True)
             wait_until_up(last)
+            processes.stop(told)
         assert last.ending() == "ended with code 0"
 
     def test_early_end_is_reported_once_with_the_log(self, tmp_path):

@@ -203,6 +203,7 @@ from rclpy.node import Node
 from biped_mfpt_ros import cli
 from biped_mfpt_ros.cli import single
 from biped_mfpt_ros.cli.client import Client
+from biped_mfpt_ros.nodes import spin
 
 def command(args):
     with Client("/alone", lambda: None):
@@ -211,6 +212,7 @@ def command(args):
     {ending}
 
 single.cycle = command
+spin.LAST_SECONDS = 1  # it is waited for
 Node.destroy_node = lambda self: re.match("(a+)+b", "a" * 60)
 sys.exit(cli.main(["cycle"]))
 """

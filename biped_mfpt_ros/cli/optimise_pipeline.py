@@ -13,7 +13,7 @@ from biped_mfpt_msgs.action import Optimise
 
 from biped_mfpt_ros.cli import CommandError
 from biped_mfpt_ros.cli.client import Client
-from biped_mfpt_ros.cli.pipeline import START_TIMEOUT, Pipeline, quoted
+from biped_mfpt_ros.cli.pipeline import CLOSING, START_TIMEOUT, Pipeline, quoted
 from biped_mfpt_ros.cli.processes import Child, Processes
 from biped_mfpt_ros.nodes.answers import Answer
 from biped_mfpt_ros.nodes.optimiser import degrees_of, goal_message
@@ -153,4 +153,6 @@ def run_study(
             goal = goal_message(name, settings)
             goal.max_trials = trials or 0
             goal.max_seconds = seconds or 0.0
-            return client.optimise(goal, on_trial)
+            ended = client.optimise(goal, on_trial)
+        processes.stop(CLOSING)
+    return ended

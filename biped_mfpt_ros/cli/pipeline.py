@@ -63,6 +63,8 @@ _MATCHED_WITHIN = 15.0
 it, seconds on a busy machine; what it published before it sends then, if it still runs: a mesh of
 some states was grown and solved, and the nodes stopped, before that."""
 _LOOK = 0.1  # s, between two looks into a bag that is being recorded
+CLOSING = 60.0
+"""s, for the recorder to close its bag when all went well: however busy the machine is."""
 _CURVE_POINTS = 40
 _PICTURE_STEPS = 6
 
@@ -130,7 +132,7 @@ def run(args: argparse.Namespace) -> None:
         )
         # The walks can have all cores, and the bag is closed whatever happens to them.
         progress.show("stopping the nodes")
-        processes.stop()
+        processes.stop(CLOSING)
         result["bag_whole"] = (directory / "bag" / "metadata.yaml").exists()
         if not result["bag_whole"]:
             if args.on_record_error == "stop":

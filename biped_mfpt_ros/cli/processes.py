@@ -129,11 +129,17 @@ class Processes:
         self._reported.add(child.name)
         _signal(child, signal.SIGTERM)
 
-    def stop(self) -> None:
-        """Stop all children, in at most 5 s."""
+    def stop(self, last_grace: float | None = None) -> None:
+        """Stop all children, in at most 5 s.
+
+        Parameters
+        ----------
+        last_grace : float, optional
+            s, for the last ones if that need not be so soon.
+        """
         with self._held():
             signals, start = self._signals, time.monotonic()
-            for last, grace in ((False, _GRACE), (True, _LAST_GRACE)):
+            for last, grace in ((False, _GRACE), (True, last_grace or _LAST_GRACE)):
                 group = [child for child in self.running() if child.last == last]
                 for child in group:
                     _signal(child, signal.SIGTERM)
