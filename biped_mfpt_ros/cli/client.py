@@ -31,6 +31,7 @@ from biped_mfpt_ros.nodes.spin import security_explained
 _Self = TypeVar("_Self", bound="Client")  # typing has Self from Python 3.11 on
 _POLL = 0.05  # s
 _PUBLISHED = 10.0  # s, for the analysis to publish an MFPT before it is asked
+_GREET_AGAIN = 1.0  # s, until what costs nothing is asked for the second time
 _ON_ITS_WAY = 120.0  # s, for the last messages of a mesh to come to the analysis
 # What a recorder has to hear of a run: it finds each of them by itself, some tenths of a second
 # after its publisher, and a small mesh is grown and solved in less.
@@ -188,7 +189,7 @@ class Client:
             self.spin()
         greeting = ComputeMfpt.Request(client=self._name)
         for ask in (lambda: compute.call_async(greeting), none.cancel_goal_async):
-            self._result(Answer(ask))
+            self._result(Answer(ask, again=_GREET_AGAIN))
         self._node.destroy_client(compute)
         grow.destroy()
 
@@ -268,7 +269,7 @@ class Client:
         # A chain may cost much, so that is asked for once, when the analysis has answered what
         # costs nothing: then it has found this client.
         greeting = ComputeMfpt.Request(client=self._name)
-        self._result(Answer(lambda: self._compute.call_async(greeting)))
+        self._result(Answer(lambda: self._compute.call_async(greeting), again=_GREET_AGAIN))
         deadline = time.monotonic() + _ON_ITS_WAY
         while True:
             try:

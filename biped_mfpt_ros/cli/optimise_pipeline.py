@@ -149,6 +149,7 @@ def run_study(
                 return not missing
 
             client.wait(up, START_TIMEOUT, "the nodes to come up")
+            client.wait_until_found()
             on_start()
             goal = goal_message(name, settings)
             goal.max_trials = trials or 0

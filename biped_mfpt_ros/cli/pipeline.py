@@ -303,6 +303,8 @@ class Pipeline:
         with Client(self.namespace, self.watch) as client:
             client.wait(partial(self.up, client), START_TIMEOUT, "the nodes to come up")
             all_there = time.monotonic() + _MATCHED_WITHIN
+            # A goal that got lost would be sent again, and a mesh may be begun twice.
+            client.wait_until_found()
             text = MeshProgress()
 
             def feedback(message: Any) -> None:
@@ -323,6 +325,7 @@ class Pipeline:
                 except _MesherKilled:
                     name = self._start_mesher()
                     client.wait(partial(client.reaches, name), START_TIMEOUT, name)
+                    client.wait_until_found()
             self._progress.show("waiting for the analysis")
             estimates = client.mfpt(grown.mesh_id, mean, list(sigmas), correlation)
             low, high = 0.5 * min(sigmas), 1.5 * max(sigmas)
