@@ -1,5 +1,6 @@
 """Answers on disk: the mesh is the same, also when the file was cut off or spoiled."""
 
+import fcntl
 import signal
 import subprocess
 import sys
@@ -138,6 +139,24 @@ def test_a_journal_has_one_owner(tmp_path):
         Journal(3, b"this", tmp_path / "j")
     first.close()
     Journal(3, b"this", tmp_path / "j").close()
+
+
+def test_a_journal_that_its_owner_removes_meanwhile_is_made_anew(tmp_path, monkeypatch):
+    path, flock, removed = tmp_path / "j", fcntl.flock, []
+
+    def late(file, how):
+        flock(file, how)
+        if not removed:
+            path.unlink()
+            removed.append(path)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    journal = Journal(3, b"this", path)
+    with pytest.raises(JournalInUse):
+        Journal(3, b"this", path)
+    journal.close()
+    assert removed
+    assert path.stat().st_size > 0
 
 
 KILLED = """

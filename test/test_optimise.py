@@ -214,7 +214,22 @@ def test_nsga2_spreads_over_the_front():
     ends = min(map(quadratic, found)), min(np.abs(x).sum() for x in found)
     assert ends[0] < 0.05  # one end: the optimum of the first objective
     assert ends[1] == 0.0  # the other: the start is that of the second
-    assert (found[-200:, 3] <= 4.5).mean() > 0.9  # within the constraint
+
+
+def test_nsga2_keeps_to_constraints():
+    # Both objectives are best at 0, where the constraint x_0 >= 1 does not hold.
+    searcher = make_searcher("nsga2", BOUNDS, seed=3, objectives=2)
+    found = np.zeros((0, 4))
+    while len(found) < 2000:
+        vectors = searcher.ask()
+        searcher.tell(vectors, [
+            Told(0.0, (float((x**2).sum()), float(np.abs(x).sum())), max(0.0, 1.0 - x[0]))
+            for x in vectors
+        ])  # fmt: skip
+        found = np.concatenate([found, vectors])
+    holds = found[:, 0] >= 1.0
+    assert holds[-200:].mean() > 0.5
+    assert 1.0 <= (found[holds] ** 2).sum(axis=1).min() < 1.05
 
 
 def test_nelder_mead_is_that_of_scipy():
@@ -603,6 +618,13 @@ def test_settings_survive_json_and_other_ones_are_refused(scored, tmp_path):
         ("correlation", {"correlation": 1.0}),
         ("threshold", {"stages": (Stage(0.5, 0.0),)}),
         ("slope_step_deg", {"stages": (Stage(0.3, 0.1),)}),
+        ("max_states", {"stages": (Stage(0.5, 0.1, max_states=1),)}),
+        ("max_states", {"stages": (Stage(0.5, 0.1, max_states=2**32),)}),
+        ("stages", {"stages": ()}),
+        ("mu_s", {"mu_s": 0.35}),
+        ("seed", {"seed": -1}),
+        ("limits[speed_min]", {"limits": {"speed_min": -0.1}}),
+        ("check_walks", {"check_walks": 0}),
         ("step", {"step": 0.0}),
         ("population", {"population": 1}),
         ("runs", {"runs": -1}),

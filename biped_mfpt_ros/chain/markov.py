@@ -296,13 +296,14 @@ class Metastability:
     ----------
     lambda_2 : float
         Second largest eigenvalue of T: probability of surviving a step, once metastable. Summed
-        up from what survives, so accurate near 0; near 1 use `failure_probability`.
+        up from what survives, so accurate near 0, but for 1e-16 where aggregation had to find the
+        distribution; near 1 use `failure_probability`.
     failure_probability : float
         1 - lambda_2, summed up from what falls, accurate relative to itself.
     mfpt : float
         Mean first-passage time, steps, eq. (35): 1 / (1 - lambda_2); inf where a state can be
         reached from x_2 from which no fall can be reached. Above 1e280 digits are lost to
-        underflow.
+        underflow, and above the largest number, 1.8e308, it is inf, too.
     distribution : numpy.ndarray
         Metastable distribution phi, shape (n,), sum 1, index 0 is 0. It has no weight on states
         that are not visited again and again. Where lambda_2 is 0 it is one from which every
@@ -783,7 +784,7 @@ def metastability(
     InputError
         If mu_s, sigma_s or correlation is not allowed.
     ChainError
-        If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
+        If the chain mixes too slowly to be iterated, and aggregation does not settle either.
     """
     try:
         return _the_one(metastabilities(mesh, mu_s, [sigma_s], correlation=correlation))
@@ -819,7 +820,7 @@ def solve_chain(
     InputError
         If an argument is not allowed.
     ChainError
-        If the chain mixes too slowly to be iterated and is too large to be solved otherwise.
+        If the chain mixes too slowly to be iterated, and aggregation does not settle either.
     """
     targets, offsets, probabilities = _check_chain(targets, probabilities, preceding)
     outcomes = checked_array("outcomes", outcomes, np.uint8, targets.shape)

@@ -390,6 +390,8 @@ class MeshGrowth:
     ------
     InputError
         If an argument is not allowed.
+    MeshLimitError
+        If the answers that are there lead to more than ``max_states`` states.
     """
 
     def __init__(

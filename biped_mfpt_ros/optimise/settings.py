@@ -174,7 +174,8 @@ class StudySettings:
             slopes = slope_set(stage.slope_step_deg, self.slope_limit_deg)
             _check("mu_s", self.mu_s, abs(self.mu_s) <= slopes[-1], "within the slope set")
             _check("threshold", stage.threshold, 0.0 < stage.threshold < math.inf, "> 0")
-            _check("max_states", stage.max_states, stage.max_states >= 2, ">= 2")
+            most = 2**32 - 1
+            _check("max_states", stage.max_states, 2 <= stage.max_states <= most, f"2 to {most}")
             _check("margin", stage.margin, not math.isnan(stage.margin), "a number")
         for sigma in self.check_sigmas:
             _check("check_sigmas", sigma, 0.0 < sigma < math.inf, "numbers > 0")

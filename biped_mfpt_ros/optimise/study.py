@@ -51,7 +51,8 @@ class Study:
     settings : StudySettings, optional
         Of a new study, or equal to those it has; those that it has by default.
     owner : str, optional
-        Under which name trials are claimed; that of this process by default.
+        Under which name trials are claimed, of the form of `this_owner`; that of this process by
+        default.
 
     Attributes
     ----------
