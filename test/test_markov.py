@@ -203,6 +203,32 @@ def test_certain_fall_has_lambda_2_zero(method, n):
     assert result.mfpt_from_state[1:] == pytest.approx(np.arange(n, 0, -1), rel=RELATIVE)
 
 
+def test_what_is_lost_to_underflow_is_no_distribution():
+    # A round from 1 over 3 and 4 is survived with 6e-243.
+    rows = [[3, 2], [4, 3], [0, 4], [1, 4]]
+    with pytest.raises(ChainError, match="4 states"):
+        solve(rows, [1.0, 6e-243])
+
+
+@pytest.mark.parametrize("e", [1e-60, 1e-85, 1e-100, 1e-102, 1e-120])
+def test_times_up_to_the_largest_number_and_beyond(method, e):
+    # Three states in a row, of which each leads to the one before with e: h_3 = 1 / e, and
+    # h_k = 1 / e + (1 - e) / e h_(k + 1).
+    result = solve([[0, 2], [1, 3], [2, 3]], [e, 1.0])
+    with mpmath.workdps(400):
+        up = 1 / mpmath.mpf(e)
+        h = [up, up + (up - 1) * up, up + (up - 1) * (up + (up - 1) * up)]
+    times = [h[2], h[2] + h[1], h[2] + h[1] + h[0]]
+    if e == 1e-120:  # 1e360
+        assert result.mfpt == math.inf
+        assert result.distribution == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=1e-100)
+        assert result.mfpt_from_state.tolist() == [0.0, math.inf, math.inf, math.inf]
+        return
+    for value, reference in zip(result.mfpt_from_state[1:], times, strict=True):
+        assert relative(value, reference) < RELATIVE
+    assert relative(result.mfpt, h[2]) < RELATIVE
+
+
 def test_small_lambda_2_is_accurate(method):
     # Only the middle one of three slopes is survived.
     result = solve([[0, 1, 0]], [0.5, 1e-30, 0.5])

@@ -371,14 +371,18 @@ def passage_times(q: csr_array, falls: np.ndarray, tolerance: float) -> np.ndarr
     Returns
     -------
     numpy.ndarray or None
-        Steps, shape (n,); None if they do not settle.
+        Steps, shape (n,), inf beyond the largest number; None if they do not settle.
     """
     n = len(falls)
-    w = _balanced(q, falls, tolerance, source=np.ones(n))
-    if w is None:
-        return None
-    entries = q.tocoo()
-    flows = w[entries.row] * entries.data / w[entries.col]
-    reverse = csr_array((flows, (entries.col, entries.row)), shape=(n, n))
-    u = _balanced(reverse, 1.0 / w, tolerance, source=w)
-    return None if u is None else u / w
+    with np.errstate(over="ignore", invalid="ignore"):
+        w = _balanced(q, falls, tolerance, source=np.ones(n))
+        if w is None:
+            return None
+        entries = q.tocoo()
+        flows = w[entries.row] * entries.data / w[entries.col]
+        reverse = csr_array((flows, (entries.col, entries.row)), shape=(n, n))
+        # u is of the size of times squared: what is scaled, by a power of 2, does not overflow.
+        source = np.ldexp(w, -np.frexp(w.max())[1])
+        u = _balanced(reverse, 1.0 / w, tolerance, source=source)
+        # No number is what infinite ones give.
+        return None if u is None else np.nan_to_num(u / source, nan=np.inf, posinf=np.inf)

@@ -110,10 +110,16 @@ def limit_distribution(
         Sum 1, shape (n,); None if it does not settle.
     """
     n = len(q)
-    power = visits(q, falls if falls.any() else np.full(n, _NO_FALLS))
+    power = visits(q, falls)
+    if not np.isfinite(power).all():
+        # Without falls, or nearly so; those from all states alike leave eigenvectors as they are.
+        power = visits(q, falls + _NO_FALLS)
     x, out = np.zeros(n), np.empty((n, n))
     for _ in range(_SQUARINGS):
-        power /= power.max()
+        largest = power.max()
+        if not largest > 0.0:
+            return None  # all of it lost to underflow
+        power /= largest
         rows = power[among]
         sums = rows.sum(axis=1)
         previous, x = x, rows[sums.argmax()] / sums.max()

@@ -329,8 +329,9 @@ class Metastability:
         """Mean number of steps to a fall from each state, the falling one counted; shape (n,).
 
         Computed when first asked for, at about twice the cost of the rest. 0 for the failure
-        state, inf for states from which one can reach some that never fall. Accurate relative
-        to itself at any size.
+        state, inf for states from which one can reach some that never fall, and above the largest
+        number. Accurate relative to itself up to 1e150; beyond, a state from which others that last
+        as long are reached too rarely for a number may lack what these add.
 
         Raises
         ------
@@ -415,7 +416,7 @@ def _iterated_times(
         largest = float(np.max(np.abs(rest) / np.maximum(first + series, 1.0)))
         if k * largest <= TOLERANCE:
             times = first + series
-            if (first > _CANCELLATION * times).any():
+            if (first / _CANCELLATION > times).any():
                 return _iterated_times(targets, offsets, probabilities, among, phi, 0.0)
             return times
         iteration.step_backward(targets, offsets, probabilities, rest, out)
