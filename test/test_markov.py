@@ -766,6 +766,20 @@ def test_chain_arrays_are_checked(field, change):
         solve_chain(**{**good, **change})
 
 
+def test_rows_of_a_large_chain_are_checked_to_the_last():
+    targets, outcomes = np.ones((9001, 2), dtype=int), np.zeros((9001, 2), dtype=int)
+    targets[0], outcomes[0], outcomes[9000, 1] = 0, NOT_SIMULATED, 3
+    with pytest.raises(InputError, match=r"^targets\[9000, 1\], outcomes\[9000, 1\]: \(1, 3\)"):
+        solve_chain(targets, outcomes, [0.5, 0.5])
+    outcomes[9000, 1] = 0
+    targets[:, 1], targets[9000, 1] = 2, 1
+    targets[0] = 0
+    preceding = np.zeros(9001, dtype=int)
+    preceding[2] = 1
+    with pytest.raises(InputError, match=r"^preceding\[1\]: 0 .* state 9000 leads"):
+        solve_chain(targets, outcomes, [[0.5, 0.5]] * 2, preceding)
+
+
 def test_too_slow_is_a_clear_error(only_iteration):
     with pytest.raises(ChainError, match="300 states"):
         solve(birth_death(300, ends=(0, 0)), [0.5, 0.5])
