@@ -80,7 +80,10 @@ def motion(control, state, switched=False, model=FREE):
     y = np.append(dynamics.to_absolute(state), 0.0)
     packed = control.packed(model.robot)
     work = empty_scratch()
-    closed_loop(control.code, switched, model.packed(), packed, work, y, rate, torques)
+    piece = float(switched)
+    if control.scheme == "spline":
+        piece = spline.piece_of(packed, y)
+    closed_loop(control.code, piece, model.packed(), packed, work, y, rate, torques)
     return np.linalg.solve(ABSOLUTE, rate[5:10]), torques
 
 

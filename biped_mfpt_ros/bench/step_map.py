@@ -19,7 +19,7 @@ from biped_mfpt_ros.bench import measure, rigid_body
 from biped_mfpt_ros.bench.flops import counted_flops
 from biped_mfpt_ros.bench.measure import SLOPES, BenchError, Section, row
 from biped_mfpt_ros.control.controller import Controller, controller, paper_controller_names
-from biped_mfpt_ros.gait.closed_loop import closed_loop, switch
+from biped_mfpt_ros.gait.closed_loop import closed_loop, piece_of
 from biped_mfpt_ros.gait.cycle import find_limit_cycle
 from biped_mfpt_ros.gait.integrate import STAGES, trial_step
 from biped_mfpt_ros.gait.scratch import MODE, SIZE, H, Y, empty_scratch
@@ -159,9 +159,9 @@ def swings_of(
 
 @kernel
 def _derivative(scheme, rob, par, w, y, rate, torques):
-    """`closed_loop`, switched as the state says."""
-    switched = not switch(scheme, par, (y[0], y[1], y[2], y[3], y[4])) > 0.0
-    closed_loop(scheme, switched, rob, par, w, y, rate, torques)
+    """`closed_loop`, of the piece that the state is in."""
+    piece = piece_of(scheme, par, (y[0], y[1], y[2], y[3], y[4]))
+    closed_loop(scheme, piece, rob, par, w, y, rate, torques)
 
 
 def _right_side(
@@ -233,7 +233,7 @@ def rigid_body_error(name: str) -> list[float]:
     work, rate, applied = empty_scratch(), np.empty(11), np.empty(4)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        closed_loop(control.code, False, rob, par, work, y, rate, applied)
+        closed_loop(control.code, 0.0, rob, par, work, y, rate, applied)
         return rate.copy()
 
     def torques(y: np.ndarray) -> np.ndarray:

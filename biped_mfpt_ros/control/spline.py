@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from biped_mfpt_ros.errors import InputError
 from biped_mfpt_ros.jit import inner_kernel
+from biped_mfpt_ros.lanes import select
 from biped_mfpt_ros.walker.impact import impact_map
 from biped_mfpt_ros.walker.robot import Robot, weighted_sum
 
@@ -43,8 +44,8 @@ coefficient (rad), then the coefficients (rad) of theta_2, q3, q4 and q5."""
 _GAINS, _FIRST, _LAST, _TABLE = 8, 8, 9, 10  # offsets into the parameters
 
 # The references are kept piece by piece, as polynomials of the fraction of the spacing, from one
-# spacing before theta_first to one after theta_last, and a constant piece for what comes then.
-_PIECES = COEFFICIENTS + 2
+# spacing before theta_first to one after theta_last, and a constant piece before and after that.
+_PIECES = COEFFICIENTS + 3
 # Offsets into the packed parameters: gains, phase where the pieces begin, 1 / spacing, polynomials.
 _KP, _KD, _START, _INVERSE, _PIECE = 0, 4, 8, 9, 10
 PACKED_SIZE = _PIECE + _PIECES * 16
@@ -70,16 +71,47 @@ def _output(par, i, piece, at, rate, value, value_rate):
 
 
 @inner_kernel
-def command(par, a, da):
-    """Accelerations ``alpha + beta z`` of the five links with ``z = ddtheta``."""
-    rate = -0.5 * (da[0] + da[2])
-    at = (-0.5 * (a[0] + a[2]) - par[_START]) * par[_INVERSE]
+def _place(par, a):
+    """Place of the phase among the pieces: from k to k + 1 in piece k."""
+    return (-0.5 * (a[0] + a[2]) - par[_START]) * par[_INVERSE]
+
+
+@inner_kernel
+def piece_of(par, a):
+    """The piece that the phase is in."""
+    at = _place(par, a)
     if not at > 0.0:  # also where it is not a number
-        at = 0.0
-    elif at > _PIECES - 1.0:
-        at = _PIECES - 1.0
-    piece = int(at)
-    at -= piece
+        return 0.0
+    return float(int(min(at, _PIECES - 1.0)))
+
+
+@inner_kernel
+def within(par, a, piece):
+    """How far the phase is inside of a piece, in spacings; negative outside of it."""
+    at = _place(par, a)
+    before, after = at - piece, piece + 1.0 - at
+    if piece == 0.0:
+        return after
+    if piece == _PIECES - 1.0:
+        return before
+    return select(before < after, before, after)
+
+
+@inner_kernel
+def next_piece(par, a, piece):
+    """The piece that follows where the phase leaves one."""
+    return piece + (1.0 if _place(par, a) > piece + 0.5 else -1.0)
+
+
+@inner_kernel
+def command(par, a, da, piece):
+    """Accelerations ``alpha + beta z`` of the five links with ``z = ddtheta``.
+
+    From the polynomials of one piece, also where the phase has left it.
+    """
+    rate = -0.5 * (da[0] + da[2])
+    at = _place(par, a) - piece
+    piece = int(piece)
     v2, b2 = _output(par, 0, piece, at, rate, a[1], da[1])
     v3, b3 = _output(par, 1, piece, at, rate, a[2] - a[0], da[2] - da[0])
     v4, b4 = _output(par, 2, piece, at, rate, a[3] - a[1], da[3] - da[1])
@@ -109,7 +141,7 @@ def references(parameters: np.ndarray, theta: ArrayLike) -> np.ndarray:
     """
     first, last = parameters[[_FIRST, _LAST]]
     spacing = (last - first) / (COEFFICIENTS - 1)
-    at = np.clip((np.asarray(theta) - first) / spacing + 1.0, 0.0, _PIECES - 1.0)
+    at = np.clip((np.asarray(theta) - first) / spacing + 2.0, 0.0, _PIECES - 1.0)
     piece = at.astype(np.intp)
     x = at - piece
     a0, a1, a2, a3 = np.moveaxis(_polynomials(parameters)[piece], (-1, -2), (0, 1))
@@ -193,7 +225,7 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
     out = np.empty(PACKED_SIZE)
     out[_KP : _KP + 4] = parameters[:4]
     out[_KD : _KD + 4] = parameters[4:8]
-    out[_START] = first - spacing
+    out[_START] = first - 2.0 * spacing
     out[_INVERSE] = 1.0 / spacing
     out[_PIECE:] = _polynomials(parameters).ravel()
     return out
@@ -202,6 +234,6 @@ def packed(parameters: np.ndarray, robot: Robot) -> np.ndarray:
 def _polynomials(parameters: np.ndarray) -> np.ndarray:
     """Polynomials of the references, piece by piece, shape (_PIECES, 4, 4): output, power."""
     table = parameters[_TABLE:].reshape(4, COEFFICIENTS)
-    window = np.arange(_PIECES)[:, None] + np.arange(-2, 2)
+    window = np.arange(_PIECES)[:, None] + np.arange(-3, 1)
     coefficients = table.T[np.clip(window.T, 0, COEFFICIENTS - 1)]
     return weighted_sum(coefficients[:, :, :, None], _BASIS)

@@ -5,36 +5,46 @@ wherever a torque reaches its limit, so the integrator keeps the set of those th
 within a step and takes its change for an event: `motion` is smooth, also beyond the point where the
 set should have changed.
 
+So are the pieces of a control law: torques on and then off in hybrid zero dynamics, references
+before and after the switch in sliding mode, the polynomials of a spline.
+
 A further control scheme is a kernel ``command(par, a, da)`` that returns the accelerations of the
-five links as ``alpha + beta z``, two tuples of five. It takes a line in `_command`, and another in
-`switch` if it has a switch; ``control/controller.py`` gives it a code and a name. Written without
-branches and tables it goes through all lanes at once; otherwise lane by lane, as the spline does.
+five links as ``alpha + beta z``, two tuples of five. It takes a line in `_command`, and others in
+`piece_of`, `within` and `next_piece` if it has pieces; ``control/controller.py`` gives it a code
+and a name. Written without branches and tables it goes through all lanes at once; otherwise lane by
+lane, as the spline does.
 """
 
 from __future__ import annotations
 
+import math
+
 from biped_mfpt_ros.control import hzd, smc, spline
-from biped_mfpt_ros.control.controller import HZD, SMC
-from biped_mfpt_ros.gait.scratch import COMMAND, CUT, MODE, SLIDES, SPARE, SWITCHED
+from biped_mfpt_ros.control.controller import HZD, SMC, SPLINE
+from biped_mfpt_ros.gait.scratch import COMMAND, CUT, MODE, PIECE, SLIDES, SPARE
 from biped_mfpt_ros.jit import inlined_kernel, inner_kernel
 from biped_mfpt_ros.lanes import LANES, any_lane, lane_of, load, select, splat
 from biped_mfpt_ros.walker import dynamics
 from biped_mfpt_ros.walker import robot as r
 
+CUT_RESOLUTION = 1e-9
+"""Of the torque limit: how far a torque may be beyond it before it is cut off."""
 _NEAR = 1e3
 """Of the torque limit: what the controller may ask for beyond it, so that the motion without it is
 found as that with it and a change: as exact as solved anew, to some 1e-12, and in half the time."""
 
 
 @inlined_kernel
-def _command(scheme, par, w, row, a, da, switched, slides):
+def _command(scheme, par, w, row, a, da, piece, slides):
     """Accelerations ``alpha + beta z`` that the controller wants, for the states in a row."""
     if scheme == HZD:
         return hzd.command(par, a, da)
     if scheme == SMC:
-        return smc.command(par, a, da, switched, slides)
+        return smc.command(par, a, da, piece, slides)
     for lane in range(LANES):
-        alpha, beta = spline.command(par, lane_angles(w, row, lane), lane_rates(w, row, lane))
+        alpha, beta = spline.command(
+            par, lane_angles(w, row, lane), lane_rates(w, row, lane), lane_of(piece, lane)
+        )
         for i in range(5):
             w[COMMAND, i, lane] = alpha[i]
             w[COMMAND, 5 + i, lane] = beta[i]
@@ -42,13 +52,39 @@ def _command(scheme, par, w, row, a, da, switched, slides):
 
 
 @inner_kernel
-def switch(scheme, par, a):
-    """Positive before the controller's switch, negative after it."""
+def piece_of(scheme, par, a):
+    """The piece of the control law that holds at some angles."""
     if scheme == HZD:
-        return hzd.switch(par, a)
+        return 0.0 if hzd.switch(par, a) > 0.0 else 1.0
     if scheme == SMC:
-        return smc.switch(par, a)
-    return 1.0 + 0.0 * a[0]
+        return 0.0 if smc.switch(par, a) > 0.0 else 1.0
+    return spline.piece_of(par, a)
+
+
+@inner_kernel
+def within(scheme, par, a, piece):
+    """Positive where a piece of the control law holds, negative outside of it."""
+    if scheme == HZD:
+        before = hzd.switch(par, a)
+    elif scheme == SMC:
+        before = smc.switch(par, a)
+    else:
+        return spline.within(par, a, piece)
+    return (1.0 if piece == 0.0 else -1.0) * before
+
+
+@inner_kernel
+def next_piece(scheme, par, a, piece):
+    """The piece of the control law that follows where one is left."""
+    if scheme == SPLINE:
+        return spline.next_piece(par, a, piece)
+    return 1.0 - piece
+
+
+@inner_kernel
+def jumps(scheme):
+    """Whether what the controller wants jumps from one piece of its law to the next."""
+    return scheme != SPLINE
 
 
 @inner_kernel
@@ -61,6 +97,17 @@ def angles(w, row):
 def rates(w, row):
     """Five rates in all lanes."""
     return (load(w, row, 5), load(w, row, 6), load(w, row, 7), load(w, row, 8), load(w, row, 9))
+
+
+@inner_kernel
+def torques_at(w, row, column):
+    """Four torques in all lanes."""
+    return (
+        load(w, row, column),
+        load(w, row, column + 1),
+        load(w, row, column + 2),
+        load(w, row, column + 3),
+    )
 
 
 @inner_kernel
@@ -104,14 +151,14 @@ def powers(u, da):
 
 
 @inner_kernel
-def _off(scheme, switched):
+def _off(scheme, piece):
     """Whether the controller has switched the torques off."""
-    return switched > (0.5 if scheme == HZD else 2.0)
+    return piece > (0.5 if scheme == HZD else math.inf)
 
 
 @inner_kernel
 def mode_of_all(w):
-    """Of all lanes: torques cut off, whether the controller has switched, which outputs slide."""
+    """Of all lanes: torques cut off, the piece of the control law, which outputs slide."""
     return (
         (
             load(w, MODE, CUT),
@@ -119,7 +166,7 @@ def mode_of_all(w):
             load(w, MODE, CUT + 2),
             load(w, MODE, CUT + 3),
         ),
-        load(w, MODE, SWITCHED),
+        load(w, MODE, PIECE),
         (
             load(w, MODE, SLIDES),
             load(w, MODE, SLIDES + 1),
@@ -139,7 +186,7 @@ def mode_of(w, lane):
             splat(w[MODE, CUT + 2, lane]),
             splat(w[MODE, CUT + 3, lane]),
         ),
-        splat(w[MODE, SWITCHED, lane]),
+        splat(w[MODE, PIECE, lane]),
         (
             splat(w[MODE, SLIDES, lane]),
             splat(w[MODE, SLIDES + 1, lane]),
@@ -174,14 +221,14 @@ def motion(scheme, rob, par, w, row, mode):
         of the angles (5 each).
     """
     a, da = angles(w, row), rates(w, row)
-    cut, switched, slides = mode
+    cut, piece, slides = mode
     s, c = dynamics.sines(a)
-    alpha, beta = _command(scheme, par, w, row, a, da, switched, slides)
+    alpha, beta = _command(scheme, par, w, row, a, da, piece, slides)
     dda = dynamics.prescribed_motion(rob, s, c, da, alpha, beta)
     x, y = dynamics.link_accelerations(s, c, da, dda)
     wanted = dynamics.required_torques(rob, s, c, dda, x, y)
     applied = wanted
-    off = _off(scheme, switched)
+    off = _off(scheme, piece)
     is_cut = _is_cut(cut, off)
     if any_lane(is_cut):
         applied = _applied(rob, cut, off, wanted)
@@ -217,16 +264,30 @@ def motion(scheme, rob, par, w, row, mode):
 
 
 @inner_kernel
-def beyond(rob, cut, wanted):
-    """How far the wanted torques are beyond where ``cut`` is right, at most, N m."""
+def beyond_each(rob, cut, wanted):
+    """How far each wanted torque is beyond where ``cut`` is right, N m."""
     limit = rob[r.TORQUE_LIMIT]
-    u0 = select(cut[0] == 0.0, abs(wanted[0]) - limit, limit - cut[0] * wanted[0])
-    u1 = select(cut[1] == 0.0, abs(wanted[1]) - limit, limit - cut[1] * wanted[1])
-    u2 = select(cut[2] == 0.0, abs(wanted[2]) - limit, limit - cut[2] * wanted[2])
-    u3 = select(cut[3] == 0.0, abs(wanted[3]) - limit, limit - cut[3] * wanted[3])
+    return (
+        select(cut[0] == 0.0, abs(wanted[0]) - limit, limit - cut[0] * wanted[0]),
+        select(cut[1] == 0.0, abs(wanted[1]) - limit, limit - cut[1] * wanted[1]),
+        select(cut[2] == 0.0, abs(wanted[2]) - limit, limit - cut[2] * wanted[2]),
+        select(cut[3] == 0.0, abs(wanted[3]) - limit, limit - cut[3] * wanted[3]),
+    )
+
+
+@inner_kernel
+def greatest(each):
+    """The most of four numbers."""
+    u0, u1, u2, u3 = each
     u0 = select(u1 > u0, u1, u0)
     u2 = select(u3 > u2, u3, u2)
     return select(u2 > u0, u2, u0)
+
+
+@inner_kernel
+def beyond(rob, cut, wanted):
+    """How far the wanted torques are beyond where ``cut`` is right, at most, N m."""
+    return greatest(beyond_each(rob, cut, wanted))
 
 
 @inner_kernel
@@ -237,15 +298,15 @@ def cut_off(rob, wanted):
 
 
 @inner_kernel
-def closed_loop(scheme, switched, rob, par, w, y, rate, torques):
+def closed_loop(scheme, piece, rob, par, w, y, rate, torques):
     """Time derivative of angles, rates and energy under a controller, for integrators of others.
 
     Parameters
     ----------
     scheme : int
         Code of the control scheme.
-    switched : bool
-        Whether the controller has switched.
+    piece : float
+        Of the control law, as `piece_of` gives it.
     rob, par : numpy.ndarray
         Packed model and controller.
     w : numpy.ndarray
@@ -260,8 +321,7 @@ def closed_loop(scheme, switched, rob, par, w, y, rate, torques):
             w[SPARE, i, lane] = y[i]
     no = splat(0.0)
     none = (no, no, no, no)
-    after = splat(1.0 if switched else 0.0)
-    dda, wanted, applied, _, _, _ = motion(scheme, rob, par, w, SPARE, (none, after, none))
+    dda, wanted, applied, _, _, _ = motion(scheme, rob, par, w, SPARE, (none, splat(piece), none))
     if any_lane(beyond(rob, none, wanted) > 0.0):
         cut = (
             cut_off(rob, wanted[0]),
@@ -269,7 +329,7 @@ def closed_loop(scheme, switched, rob, par, w, y, rate, torques):
             cut_off(rob, wanted[2]),
             cut_off(rob, wanted[3]),
         )
-        dda, _, applied, _, _, _ = motion(scheme, rob, par, w, SPARE, (cut, after, none))
+        dda, _, applied, _, _, _ = motion(scheme, rob, par, w, SPARE, (cut, splat(piece), none))
     rate[10] = 0.0
     power = powers(applied, rates(w, SPARE))
     for i in range(5):

@@ -9,20 +9,25 @@ import math
 
 from biped_mfpt_ros.control import smc
 from biped_mfpt_ros.gait.closed_loop import (
+    CUT_RESOLUTION,
     beyond,
+    beyond_each,
+    greatest,
     margin,
     mode_of,
     motion,
-    switch,
+    within,
 )
 from biped_mfpt_ros.gait.integrate import state_at
 from biped_mfpt_ros.gait.scratch import (
     AT,
     CUT,
+    EACH,
     MODE,
+    PIECE,
     PLACES,
     SPARE,
-    SWITCHED,
+    START,
     TRIED,
     TRIED_TORQUES,
     TRIED_VALUE,
@@ -34,8 +39,6 @@ from biped_mfpt_ros.walker import robot as r
 
 TIME_RESOLUTION = 1e-12
 """s, to which events are located."""
-CUT_RESOLUTION = 1e-9
-"""Of the torque limit: how far a torque may be beyond it before it is cut off."""
 TORQUES, SLIP, LIFT = range(3)
 """What changes its sign: torques beyond their limits, the margin against slipping, the load."""
 _MOST_ROUNDS = 60
@@ -50,12 +53,11 @@ def next_guess(low, low_value, high, high_value):
 
 @inner_kernel
 def _seek(scheme, rob, par, w, lane, output):
-    """What `_first_negative` is about, at the places of row PLACES; ``output`` -1: the switch."""
+    """What `_first_negative` is about, at the places of row PLACES; ``output`` -1: the piece."""
     at = load(w, PLACES, AT)
     if output < 0:
         a, _ = state_at(w, lane, at)
-        sign = -1.0 if w[MODE, SWITCHED, lane] > 0.5 else 1.0
-        store(w, PLACES, VALUE, sign * switch(scheme, par, a))
+        store(w, PLACES, VALUE, within(scheme, par, a, w[MODE, PIECE, lane]))
     else:
         store(w, PLACES, VALUE, _off_slide(scheme, rob, par, w, lane, output, at))
 
@@ -85,8 +87,8 @@ def _first_negative(scheme, rob, par, w, lane, output, span):
 
 
 @inner_kernel
-def switch_root(scheme, rob, par, w, lane, span):
-    """Where the controller switches, as a fraction of the step: just on the far side."""
+def piece_root(scheme, rob, par, w, lane, span):
+    """Where a piece of the control law ends, as a fraction of the step: just on the far side."""
     return _first_negative(scheme, rob, par, w, lane, -1, span)
 
 
@@ -220,51 +222,84 @@ def _crossing(scheme, rob, par, w, lane, what, low, high, places, enough, span):
 
 
 @inner_kernel
-def _beyond_between(scheme, rob, par, w, lane, values, slack):
-    """Where torques are beyond their limits for less than a quarter of the step, by parabolas.
+def _try_torques(scheme, rob, par, w, lane):
+    """How far torques are beyond their limits at the places of row PLACES: each, and at most."""
+    cut, _, _ = mode_of(w, lane)
+    wanted, _, _ = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
+    each = beyond_each(rob, cut, wanted)
+    for i in range(4):
+        store(w, PLACES, EACH + i, each[i])
+    store(w, PLACES, VALUE, greatest(each))
 
-    ``values`` are how far they are beyond at the fractions 0, 1/4 ... 1: nowhere by ``slack``.
+
+@inner_kernel
+def _parabola(low, middle, high):
+    """Peak of the parabola through three values: in spacings from the middle one, and its height.
+
+    The highest end where it lies beyond it; minus infinity where the parabola has none.
+    """
+    bend = low - 2.0 * middle + high
+    if not bend < 0.0:
+        return 0.0, -math.inf
+    shift = min(max(0.5 * (low - high) / bend, -1.0), 1.0)
+    return shift, middle + 0.5 * shift * (high - low) + 0.5 * shift * shift * bend
+
+
+@inner_kernel
+def _may_exceed(low, middle, high, peak):
+    """Whether a torque may be beyond its limit by what it differs from the parabola."""
+    return peak > -0.25 * (max(low, middle, high) - min(low, middle, high))
+
+
+@inner_kernel
+def _beyond_between(scheme, rob, par, w, lane, start, before, slack):
+    """Where a torque is beyond its limit for less than a quarter of the step, by parabolas.
+
+    ``start`` is how far each is beyond at the start of the step, and ``before`` how many of the
+    fractions 1/4, 1/2, 3/4 and 1, which stand in row PLACES, come before the first at which one is
+    beyond by more than ``slack``.
 
     Returns
     -------
     tuple
-        Fraction, how far they are beyond there, by ``slack`` at most if nowhere; evaluations made.
+        Fraction, how far a torque is beyond there, minus infinity if nowhere; evaluations made.
     """
-    cut, _, _ = mode_of(w, lane)
-    j = 1
-    for k in range(2, 4):
-        if values[k] > values[j]:
-            j = k
-    at, part = 0.25 * j, 0.25
-    low, middle, high = values[j - 1], values[j], values[j + 1]
+    torque, at, low, middle, high = -1, 0.0, 0.0, 0.0, 0.0
+    shift, peak = 0.0, -math.inf
+    for i in range(4):
+        f0 = min(start[i], 0.0)
+        f1, f2 = w[PLACES, EACH + i, 0], w[PLACES, EACH + i, 1]
+        for k in range(1, min(before, 3) + 1):
+            if k > 1:
+                f0, f1, f2 = f1, f2, w[PLACES, EACH + i, k]
+            if f2 > slack:
+                break
+            one, top = _parabola(f0, f1, f2)
+            if abs(one) < 1.0 and top > peak and _may_exceed(f0, f1, f2, top):
+                torque, at, low, middle, high = i, 0.25 * k, f0, f1, f2
+                shift, peak = one, top
+    part = 0.25
     evaluations = 0
     for _ in range(4):
-        bend = low - 2.0 * middle + high
-        if not bend < 0.0:
-            break
-        shift = min(max(0.5 * (low - high) / bend, -1.0), 1.0)
-        peak = middle + 0.5 * shift * (high - low) + 0.5 * shift * shift * bend
-        # What the torque differs from the parabola, by its spread.
-        if peak < -0.25 * (max(low, middle, high) - min(low, middle, high)):
+        if torque < 0 or not _may_exceed(low, middle, high, peak):
             break
         at, part = min(max(at + shift * part, 0.25 * part), 1.0 - 0.25 * part), 0.25 * part
         for n in range(LANES):
             w[PLACES, AT, n] = min(at + (n - 1) * part, 1.0)
-        wanted, _, _ = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
-        store(w, PLACES, VALUE, beyond(rob, cut, wanted))
+        _try_torques(scheme, rob, par, w, lane)
         evaluations += LANES
         for n in range(LANES):
             if w[PLACES, VALUE, n] > slack:
                 return w[PLACES, AT, n], w[PLACES, VALUE, n], evaluations
-        low, middle, high = w[PLACES, VALUE, 0], w[PLACES, VALUE, 1], w[PLACES, VALUE, 2]
-    return at, middle, evaluations
+        low, middle = w[PLACES, EACH + torque, 0], w[PLACES, EACH + torque, 1]
+        high = w[PLACES, EACH + torque, 2]
+        shift, peak = _parabola(low, middle, high)
+    return 0.0, -math.inf, evaluations
 
 
 @inner_kernel
-def first_change(scheme, rob, par, w, lane, start, span):
+def first_change(scheme, rob, par, w, lane, span):
     """When the first torque reaches its limit, or leaves it, and which.
-
-    ``start`` is how far torques are beyond their limits at the start of the step, N m.
 
     Returns
     -------
@@ -272,24 +307,32 @@ def first_change(scheme, rob, par, w, lane, start, span):
         Fraction of the step, the joint and whether it is held at the limit from then on: 0 or the
         sign of its torque; 2, -1 and 0 if none does. Evaluations made.
     """
-    cut, _, _ = mode_of(w, lane)
     slack = CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
     for n in range(LANES):
         w[PLACES, AT, n] = (n + 1) / LANES
-    wanted, _, _ = motion_at(scheme, rob, par, w, lane, load(w, PLACES, AT))
-    store(w, PLACES, VALUE, beyond(rob, cut, wanted))
+    _try_torques(scheme, rob, par, w, lane)
     f0, f1 = w[PLACES, VALUE, 0], w[PLACES, VALUE, 1]
     f2, f3 = w[PLACES, VALUE, 2], w[PLACES, VALUE, 3]
-    evaluations = LANES
-    if f0 <= slack and f1 <= slack and f2 <= slack and f3 <= slack:
-        at, value, more = _beyond_between(
-            scheme, rob, par, w, lane, (min(start, 0.0), f0, f1, f2, f3), slack
-        )
-        evaluations += more
-        if not value > slack:
-            return 2.0, -1, 0.0, evaluations
+    before = 0
+    while before < LANES and w[PLACES, VALUE, before] <= slack:
+        before += 1
+    cut = (
+        w[MODE, CUT, lane],
+        w[MODE, CUT + 1, lane],
+        w[MODE, CUT + 2, lane],
+        w[MODE, CUT + 3, lane],
+    )
+    each = beyond_each(
+        rob, cut, (w[START, 0, lane], w[START, 1, lane], w[START, 2, lane], w[START, 3, lane])
+    )
+    at, value, evaluations = _beyond_between(scheme, rob, par, w, lane, each, before, slack)
+    start = greatest(each)
+    evaluations += LANES
+    if value > slack:
         low, high = (0.0, min(start, -slack)), (at, value)
         places = (0.2 * at, 0.4 * at, 0.6 * at, 0.8 * at)
+    elif before == LANES:
+        return 2.0, -1, 0.0, evaluations
     else:
         # What is at the limit, to rounding, is not beyond it yet.
         f0, f1, f2 = f0 - slack, f1 - slack, f2 - slack
@@ -333,7 +376,7 @@ def slide_root(scheme, rob, par, w, lane, output, span):
 def _off_slide(scheme, rob, par, w, lane, output, at):
     """`smc.off_slide` at fractions in lanes, positive also where a torque is near its limit."""
     a, da = state_at(w, lane, at)
-    off = smc.off_slide(par, output, a, da, splat(w[MODE, SWITCHED, lane]))
+    off = smc.off_slide(par, output, a, da, splat(w[MODE, PIECE, lane]))
     if any_lane(off <= 0.0):
         wanted, _, _ = motion_at(scheme, rob, par, w, lane, at)
         cut, _, _ = mode_of(w, lane)

@@ -1,7 +1,7 @@
 """One step of the integrator in all lanes, and its dense output.
 
 Dormand and Prince's pair of order 8(5,3) with the dense output of order 7 that Hairer made for it
-[1]_. Torque limits and controllers' switches are events, so that a step is smooth.
+[1]_. Torque limits and ends of pieces of the control law are events, so that a step is smooth.
 
 References
 ----------
@@ -16,17 +16,19 @@ import math
 import numpy as np
 
 from biped_mfpt_ros.gait.closed_loop import (
+    CUT_RESOLUTION,
     angles,
-    beyond,
+    beyond_each,
+    greatest,
     margin,
     mode_of_all,
     motion,
     powers,
     rates,
+    torques_at,
 )
 from biped_mfpt_ros.gait.scratch import (
     BEYOND,
-    CLEARANCE,
     COSINES,
     DENSE,
     END,
@@ -36,6 +38,7 @@ from biped_mfpt_ros.gait.scratch import (
     GOOD,
     LEAST,
     LEAST_NORMAL,
+    MAY_CUT,
     MODE,
     MOST,
     NORMAL,
@@ -43,9 +46,11 @@ from biped_mfpt_ros.gait.scratch import (
     SIZE,
     SPARE,
     STAGE,
+    START,
     STATES,
     TANGENTIAL,
     TURNS,
+    WANTED,
     WORK,
     WORKS,
     Y_NEW,
@@ -60,6 +65,7 @@ STAGES = 12
 """Evaluations of a step: the last, at its end, is the next step's first."""
 DENSE_STAGES = 3
 """Further evaluations for the dense output."""
+_BETWEEN_STAGES = 0.02  # of the torque limit: how much more a torque may be than at any stage
 POWER_STAGES = (5, 9, 10, STAGES)
 """Stages, after the first, at whose powers a step is searched for changes of their signs."""
 
@@ -358,6 +364,18 @@ def columns_of(w):
 
 
 @inner_kernel
+def _may_cut(rob, start, most, end):
+    """Whether a torque may reach or leave its limit in the step.
+
+    From how far it is beyond it at the start, at the stages at most, and at the end. One that is
+    nearest to it within the step may get there between two stages.
+    """
+    limit = rob[r.TORQUE_LIMIT]
+    between = most > select(start > end, start, end)
+    return most > select(between, -_BETWEEN_STAGES * limit, CUT_RESOLUTION * limit)
+
+
+@inner_kernel
 def trial_step(scheme, rob, par, w):
     """Try a step in all lanes, from row Y, whose derivative stands in row STAGE, to row Y_NEW.
 
@@ -369,7 +387,9 @@ def trial_step(scheme, rob, par, w):
     least = h * 0.0 + math.inf
     most = -least
     normal = least
-    over = most
+    start = beyond_each(rob, mode[0], torques_at(w, START, 0))
+    u = start
+    m0, m1, m2, m3 = most, most, most, most
     for stage in range(1, STAGES + 1):
         taken = columns if stage == STAGES else STATES
         wanted, force, s, c = _stage(scheme, rob, par, w, h, stage, Y_NEW, taken, mode)
@@ -377,19 +397,24 @@ def trial_step(scheme, rob, par, w):
         least = select(m < least, m, least)
         most = select(m > most, m, most)
         normal = select(force[1] < normal, force[1], normal)
-        u = beyond(rob, mode[0], wanted)
-        over = select(u > over, u, over)
+        u = beyond_each(rob, mode[0], wanted)
+        m0, m1 = select(u[0] > m0, u[0], m0), select(u[1] > m1, u[1], m1)
+        m2, m3 = select(u[2] > m2, u[2], m2), select(u[3] > m3, u[3], m3)
         if stage == STAGES:
             for i in range(5):
                 store(w, END, SINES + i, s[i])
                 store(w, END, COSINES + i, c[i])
+            for i in range(4):
+                store(w, END, WANTED + i, wanted[i])
             store(w, ESTIMATE, TANGENTIAL, force[0])
             store(w, ESTIMATE, NORMAL, force[1])
-            store(w, ESTIMATE, CLEARANCE, u)
     store(w, ESTIMATE, LEAST, least)
     store(w, ESTIMATE, MOST, most)
     store(w, ESTIMATE, LEAST_NORMAL, normal)
-    store(w, ESTIMATE, BEYOND, over)
+    may = _may_cut(rob, start[0], m0, u[0]) | _may_cut(rob, start[1], m1, u[1])
+    may = may | _may_cut(rob, start[2], m2, u[2]) | _may_cut(rob, start[3], m3, u[3])
+    store(w, ESTIMATE, MAY_CUT, select(may, 1.0, h * 0.0))
+    store(w, ESTIMATE, BEYOND, greatest(u))
     for i in range(WORK, columns):
         power = load(w, STAGE, i)
         low, high = power, power
@@ -432,6 +457,8 @@ def take_step(w):
         store(w, Y, i, select(good, load(w, Y_NEW, i), load(w, Y, i)))
     for i in range(columns_of(w)):
         store(w, STAGE, i, select(good, load(w, STAGE + STAGES, i), load(w, STAGE, i)))
+    for i in range(4):
+        store(w, START, i, select(good, load(w, END, WANTED + i), load(w, START, i)))
 
 
 @inner_kernel

@@ -28,8 +28,9 @@ WORK = 10
     FEET,  # swing foot within the step: x, y (m), dx, dy (m/s), some places in the lanes
     PLACES,  # of one lane, at as many fractions of the step as there are lanes: columns below
     SLIDING,  # how far four outputs are from sliding at the end of the step: not at 0 and below
-) = range(10)
-LOBE = 10
+    START,  # torques wanted where the step starts (4, N m)
+) = range(11)
+LOBE = 11
 """Row of the first of four joints: up to four fractions of the step where the joint's power changes
 its sign, 2 after the last, then its work up to each of them (J)."""
 STAGE = LOBE + 4
@@ -38,18 +39,18 @@ DENSE = STAGE + 16
 """Row of the first of seven coefficients of the dense output."""
 ROWS = DENSE + 7
 
-# Columns of MODE: signs of the torques cut off (4), whether the controller has switched (0 or 1),
-# length of the step (s), which outputs are in sliding mode (4, 0 or 1), whether the step just tried
+# Columns of MODE: signs of the torques cut off (4), the piece of the control law that holds, length
+# of the step (s), which outputs are in sliding mode (4, 0 or 1), whether the step just tried
 # is good (0 or 1); and whether works are integrated for the energy (0 or 1, the same in all lanes).
-CUT, SWITCHED, H, SLIDES, GOOD, WORKS = 0, 4, 5, 6, 10, 11
-# Columns of END: sines (5) and cosines (5) of the angles.
-SINES, COSINES = 0, 5
+CUT, PIECE, H, SLIDES, GOOD, WORKS = 0, 4, 5, 6, 10, 11
+# Columns of END: sines (5) and cosines (5) of the angles, torques that are wanted (4, N m).
+SINES, COSINES, WANTED = 0, 5, 10
 # Columns of ESTIMATE: error over the tolerance and its eighth root, least and greatest margin
-# against slipping and least normal force over the stages (N), how far a torque is beyond its limit,
-# at most (N m), and at the end of the step: force (N), and the latter again; of four joints, the
-# product of the least and the greatest power over some stages (W^2): below zero where it changes
-# its sign.
-ERROR, ERROR_ROOT, LEAST, MOST, LEAST_NORMAL, BEYOND, TANGENTIAL, NORMAL, CLEARANCE = range(9)
+# against slipping and least normal force over the stages (N), whether a torque may reach or leave
+# its limit (0 or 1), and at the end of the step: force (N), and how far a torque is beyond its
+# limit, at most (N m); of four joints, the product of the least and the greatest power over some
+# stages (W^2): below zero where it changes its sign.
+ERROR, ERROR_ROOT, LEAST, MOST, LEAST_NORMAL, MAY_CUT, TANGENTIAL, NORMAL, BEYOND = range(9)
 TURNS = 9
 
 
@@ -60,8 +61,9 @@ def empty_scratch():
 
 
 # Columns of PLACES: fraction, a value and the normal force there; while a crossing is sought,
-# fraction, value and the torques wanted (4).
+# fraction, value and the torques wanted (4); how far each torque is beyond its limit (4, N m).
 AT, VALUE, LOAD, TRIED, TRIED_VALUE, TRIED_TORQUES = range(6)
+EACH = 9
 
 # Rows of the ground ahead of a lane, of shape (AHEAD, m + LANES), one column for a slope.
 (
@@ -97,7 +99,7 @@ AHEAD = 26
     SAMPLES,  # in the trace
     FAILURE,  # outcome of the slopes not yet decided, once known; -1 before
     CHANGES,  # 1 if the set of torques cut off changes in it
-    SWITCHES,  # 1 if the controller switches in it
+    SWITCHES,  # 1 if the control law goes on to another piece in it
     SLIPS,  # 1 if the stance foot may slip or lift in it
     NEAR,  # 1 if the swing foot may meet the ground in it
     END_X,  # swing foot at the end of the step
@@ -105,9 +107,8 @@ AHEAD = 26
     END_DX,
     END_DY,
     SLIDE,  # 1 if an output begins to slide in it
-    START_BEYOND,  # N m, how far torques are beyond their limits at the start of the step, at most
     LAST_H,  # length of the step before, 0 if the motion was not smooth since then
     LAST_ROOT,  # eighth root of its error
     RESTARTS,  # 1: the motion is evaluated anew, 2: also which torques are cut off
-) = range(30)
-VARIABLES = 30
+) = range(29)
+VARIABLES = 29

@@ -15,26 +15,28 @@ from biped_mfpt_ros.gait.closed_loop import (
     angles,
     beyond,
     cut_off,
+    jumps,
     lane_angles,
     lane_rates,
     margin,
     mode_of_all,
     motion,
+    next_piece,
+    piece_of,
     powers,
     rates,
-    switch,
+    within,
 )
 from biped_mfpt_ros.gait.energy import energy_at, energy_at_end, find_lobes
 from biped_mfpt_ros.gait.events import (
-    CUT_RESOLUTION,
     LIFT,
     SLIP,
     first_change,
     force_once,
     motion_at,
+    piece_root,
     slide_root,
     slip_root,
-    switch_root,
 )
 from biped_mfpt_ros.gait.ground import (
     FOOT_INTERVAL,
@@ -61,7 +63,6 @@ from biped_mfpt_ros.gait.scratch import (
     BACK_SIN,
     BEYOND,
     CHANGES,
-    CLEARANCE,
     COSINE,
     COSINES,
     CUT,
@@ -90,12 +91,14 @@ from biped_mfpt_ros.gait.scratch import (
     LOAD,
     LOWEST,
     MARGIN,
+    MAY_CUT,
     MODE,
     MOST,
     NEAR,
     NORMAL,
     OUTCOME,
     PASSED,
+    PIECE,
     PLACES,
     RESTARTS,
     SAMPLES,
@@ -108,10 +111,9 @@ from biped_mfpt_ros.gait.scratch import (
     SLIPS,
     SPENT,
     STAGE,
-    START_BEYOND,
+    START,
     STATES,
     STEPS,
-    SWITCHED,
     SWITCHES,
     TANGENTIAL,
     TIME,
@@ -139,7 +141,6 @@ _LONGEST_STEP = FOOT_PARTS * FOOT_INTERVAL  # s
 _SHORTEST_STEP = 1e-9  # s, up to an event
 _OFF_CUBIC = 3e-3  # m: what the height of the foot differs from a cubic over a step, at most
 _LEAST_ROOT = 0.5623  # of an error of 0.01: smaller ones tell nothing about how errors grow
-_BETWEEN_STAGES = 0.02  # of the torque limit: how much more a torque may be than at any stage
 _TRACE_SAMPLES = 8  # of every integrator step
 SAMPLE_COLUMNS = 18  # of a trace: t, a (5), da (5), u (4), tangential, normal force, energy
 
@@ -216,7 +217,7 @@ def begin(scheme, rob, par, w, v, lane, state, previous, ahead):
     v[LAST_H, lane] = 0.0
     v[BACK_SIN, lane], v[BACK_COS, lane] = sine_cosine(previous)
     w[MODE, H, lane] = 0.013 * eighth_root(rob[r.TOLERANCE] / 1e-9)
-    w[MODE, SWITCHED, lane] = 0.0 if switch(scheme, par, lane_angles(w, Y, lane)) > 0.0 else 1.0
+    w[MODE, PIECE, lane] = piece_of(scheme, par, lane_angles(w, Y, lane))
     v[RESTARTS, lane] = 2.0
     lanes_s, lanes_c, normal = _restart(scheme, rob, par, w, v)
     s, c = _of_lane(lanes_s, lane), _of_lane(lanes_c, lane)
@@ -282,8 +283,8 @@ def _restart(scheme, rob, par, w, v):
                 w[STAGE, 5 + i, lane] = lane_of(dda[i], lane)
             for i in range(4):
                 w[STAGE, WORK + i, lane] = lane_of(power[i], lane)
+                w[START, i, lane] = lane_of(wanted[i], lane)
             v[MARGIN, lane] = lane_of(spare, lane)
-            v[START_BEYOND, lane] = lane_of(over, lane)
             if v[RESTARTS, lane] > 1.0 and v[SINCE, lane] < 0.0 and not v[MARGIN, lane] > 0.0:
                 v[SINCE, lane] = v[TIME, lane]
                 if rob[r.SLIP_DURATION] == 0.0:
@@ -299,13 +300,13 @@ def _find_slides(rob, par, w):
     Not at all where a torque is at its limit or near, or an output slides already.
     """
     a, da = angles(w, Y_NEW), rates(w, Y_NEW)
-    cut, switched, slides = mode_of_all(w)
+    cut, piece, slides = mode_of_all(w)
     may = (cut[0] == 0.0) & (cut[1] == 0.0) & (cut[2] == 0.0) & (cut[3] == 0.0)
-    may = may & (load(w, ESTIMATE, CLEARANCE) <= -smc.CLEAR * rob[r.TORQUE_LIMIT])
+    may = may & (load(w, ESTIMATE, BEYOND) <= -smc.CLEAR * rob[r.TORQUE_LIMIT])
     for i in range(4):
         store(w, SLIDING, i, math.inf)
         if any_lane(may):
-            off = smc.off_slide(par, i, a, da, switched)
+            off = smc.off_slide(par, i, a, da, piece)
             store(w, SLIDING, i, select(may & (slides[i] == 0.0), off, math.inf))
 
 
@@ -328,7 +329,7 @@ def _choose_slides(par, w, lane, may):
         slides = w[MODE, SLIDES + i, lane] != 0.0
         off = math.inf
         if may and not cut:
-            off = smc.off_slide(par, i, a, da, w[MODE, SWITCHED, lane])
+            off = smc.off_slide(par, i, a, da, w[MODE, PIECE, lane])
         if slides == cut and (cut or off <= 0.0):
             w[MODE, SLIDES + i, lane] = 0.0 if slides else 1.0
             changed = True
@@ -423,9 +424,8 @@ def _inspect(scheme, rob, par, w, v, lane, ahead):
         return False
     w[MODE, GOOD, lane] = 1.0
     v[STEPS, lane] += 1.0
-    changes = _may_cut(rob, w, v, lane)
-    switched = w[MODE, SWITCHED, lane] > 0.5
-    switches = (switch(scheme, par, lane_angles(w, Y_NEW, lane)) > 0.0) == switched
+    changes = w[ESTIMATE, MAY_CUT, lane] != 0.0
+    switches = not within(scheme, par, lane_angles(w, Y_NEW, lane), w[MODE, PIECE, lane]) > 0.0
     least = min(w[ESTIMATE, LEAST, lane], v[MARGIN, lane])
     most = max(w[ESTIMATE, MOST, lane], v[MARGIN, lane])
     uncertain = 0.25 * (most - least) + 1e-3 * rob[r.MASS] * rob[r.GRAVITY]
@@ -453,18 +453,6 @@ def _inspect(scheme, rob, par, w, v, lane, ahead):
 
 
 @inner_kernel
-def _may_cut(rob, w, v, lane):
-    """Whether a torque may reach or leave its limit in the step.
-
-    One that is nearest to it within the step may get there between two stages.
-    """
-    most = w[ESTIMATE, BEYOND, lane]
-    if most > max(v[START_BEYOND, lane], w[ESTIMATE, CLEARANCE, lane]):
-        return most > -_BETWEEN_STAGES * rob[r.TORQUE_LIMIT]
-    return most > CUT_RESOLUTION * rob[r.TORQUE_LIMIT]
-
-
-@inner_kernel
 def _may_reach(v, lane, nx, ny, h):
     """Whether the swing foot may come down to ``nx x + ny y = 0`` in the step."""
     f0 = nx * v[FOOT_X, lane] + ny * v[FOOT_Y, lane]
@@ -480,17 +468,15 @@ def _finish(scheme, rob, par, w, v, lane, ahead, trace):
     h, t = w[MODE, H, lane], v[TIME, lane]
     find_lobes(w, lane)
 
-    # The step ends early where a torque reaches or leaves its limit, or the controller switches.
+    # The step ends early where a torque reaches or leaves its limit, or a piece of the law ends.
     end, joint, held, switches = 1.0, -1, 0.0, False
     if v[CHANGES, lane] != 0.0:
-        at, joint, held, evaluations = first_change(
-            scheme, rob, par, w, lane, v[START_BEYOND, lane], h
-        )
+        at, joint, held, evaluations = first_change(scheme, rob, par, w, lane, h)
         v[EVALUATIONS, lane] += evaluations
         if joint >= 0:
             end = min(1.0, max(at, _SHORTEST_STEP / h))
     if v[SWITCHES, lane] != 0.0:
-        at = switch_root(scheme, rob, par, w, lane, h)
+        at = piece_root(scheme, rob, par, w, lane, h)
         if at <= end:
             end, joint, switches = at, -1, True
     if v[SLIDE, lane] != 0.0:
@@ -528,15 +514,16 @@ def _finish(scheme, rob, par, w, v, lane, ahead, trace):
     if joint >= 0:
         w[MODE, CUT + joint, lane] = held
     if switches:
-        w[MODE, SWITCHED, lane] = 1.0 - w[MODE, SWITCHED, lane]
-        w[MODE, H, lane] = min(w[MODE, H, lane], 0.25 * h)
+        a = lane_angles(w, Y_NEW, lane)
+        w[MODE, PIECE, lane] = next_piece(scheme, par, a, w[MODE, PIECE, lane])
+        if jumps(scheme):
+            w[MODE, H, lane] = min(w[MODE, H, lane], 0.25 * h)
     slides = scheme == SMC and not switches and _choose_slides(par, w, lane, v[SLIDE, lane] != 0.0)
     v[LAST_H, lane], v[LAST_ROOT, lane] = h, max(w[ESTIMATE, ERROR_ROOT, lane], _LEAST_ROOT)
     if end < 1.0 or joint >= 0 or switches or slides:
         v[LAST_H, lane] = 0.0
-        v[RESTARTS, lane] = 2.0 if switches else 1.0
+        v[RESTARTS, lane] = 2.0 if switches and jumps(scheme) else 1.0
     else:
-        v[START_BEYOND, lane] = w[ESTIMATE, CLEARANCE, lane]
         v[MARGIN, lane] = margin(rob, (w[ESTIMATE, TANGENTIAL, lane], w[ESTIMATE, NORMAL, lane]))
 
 
