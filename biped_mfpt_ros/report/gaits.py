@@ -33,6 +33,7 @@ from biped_mfpt_ros.report.style import (
     STANCE,
     SWING,
     Picture,
+    legend_below,
     new_figure,
     pixels,
     png,
@@ -467,7 +468,7 @@ def torques(swings: Mapping[str, Trace], model: WalkerModel, name: str) -> Pictu
     handles, labels = panels[0, 0].get_legend_handles_labels()
     handles += panels[1, 0].get_legend_handles_labels()[0]
     labels += panels[1, 0].get_legend_handles_labels()[1]
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    legend_below(figure, handles, labels)
     limit = (
         "There is no torque limit."
         if math.isinf(model.torque_limit)

@@ -26,6 +26,7 @@ from biped_mfpt_ros.report.style import (
     PAPER,
     SLOPES,
     Picture,
+    legend_below,
     new_figure,
     png,
     slope_norm,
@@ -338,10 +339,11 @@ def where_it_falls(
         top.set_xlim(max(edges[0], first - margin), min(edges[-1], last + margin))
     visible = np.maximum(ways.max(axis=1), before.sum(axis=1)) > 0.01
     seen = [outcome for outcome, shown in zip(_FALLS, visible, strict=True) if shown]
-    figure.legend(
-        handles=[Patch(color=OUTCOME_COLOURS[outcome], label=outcome.label) for outcome in seen],
-        loc="outside lower center", ncols=3, frameon=False,
-    )  # fmt: skip
+    legend_below(
+        figure,
+        [Patch(color=OUTCOME_COLOURS[outcome]) for outcome in seen],
+        [outcome.label for outcome in seen],
+    )
     return Picture(
         f"Where and why {name} falls",
         _falls_text(name, slopes_deg, share, found, mu_s, sigma_s, correlation),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
@@ -78,6 +79,17 @@ class Picture:
 def new_figure(height: float, width: float = WIDTH) -> Figure:
     """An empty figure, inches; `pixels` draws it, without a display."""
     return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+
+
+def legend_below(figure: Figure, handles: Sequence[Artist], labels: Sequence[str]) -> None:
+    """Put a legend of three columns below all axes of a `new_figure`.
+
+    As ``loc="outside lower center"`` does from matplotlib 3.7 on; Ubuntu 24.04 has 3.6.
+    """
+    legend = figure.legend(handles, labels, loc="lower center", ncols=3, frameon=False)
+    height = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer()).height
+    share = height / figure.bbox.height
+    figure.get_layout_engine().set(rect=(0.0, share, 1.0, 1.0 - share))
 
 
 def pixels(figure: Figure) -> np.ndarray:
