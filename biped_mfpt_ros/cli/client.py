@@ -177,21 +177,15 @@ class Client:
         )
 
     def wait_until_found(self) -> None:
-        """Wait until mesher and analysis have found all that this process has on the graph by now.
-
-        A node finds it in the order in which it was made, so that it has found all of it when it
-        answers a client that was made last.
-        """
-        compute = self._node.create_client(ComputeMfpt, "compute_mfpt", qos_profile=REQUESTS)
-        grow = ActionClient(self._node, GrowMesh, "grow_mesh")
-        none = ClientGoalHandle(grow, UUID(uuid=[1] * 16), GrowMesh.Impl.SendGoalService.Response())
-        while not (compute.service_is_ready() and grow.server_is_ready()):
+        """Wait until mesher and analysis have found this client, and answer it."""
+        while not (self._compute.service_is_ready() and self._grow.server_is_ready()):
             self.spin()
+        none = ClientGoalHandle(
+            self._grow, UUID(uuid=[1] * 16), GrowMesh.Impl.SendGoalService.Response()
+        )
         greeting = ComputeMfpt.Request(client=self._name)
-        for ask in (lambda: compute.call_async(greeting), none.cancel_goal_async):
+        for ask in (lambda: self._compute.call_async(greeting), none.cancel_goal_async):
             self._result(Answer(ask, again=_GREET_AGAIN))
-        self._node.destroy_client(compute)
-        grow.destroy()
 
     def wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
         """Wait until a condition holds; WaitedInVain after ``timeout`` seconds."""
