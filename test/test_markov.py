@@ -752,6 +752,8 @@ def test_slopes_must_ascend(slopes):
         ("probabilities", {"probabilities": [1.0]}),
         ("probabilities", {"probabilities": [0.5, 0.4]}),
         ("probabilities", {"probabilities": [1.5, -0.5]}),
+        (r"outcomes\[1, 1\]", {"outcomes": [[255, 255], [0, 255]]}),
+        (r"outcomes\[1, 1\]", {"outcomes": [[255, 255], [0, 11]]}),
         ("probabilities", {"probabilities": [math.nan, 1.0]}),
     ],
 )

@@ -45,7 +45,7 @@ from biped_mfpt_ros.walker.outcome import Outcome
 from biped_mfpt_ros.walker.terrain import check_slopes
 
 # As a plain number: with a member of an enumeration NumPy compares in 64 bits, ten times slower.
-_STEP = int(Outcome.STEP)
+_STEP, _LAST_OUTCOME = int(Outcome.STEP), int(max(Outcome))
 
 NOT_SIMULATED = 255
 """What stands for the outcomes of the failure state, from which no step is taken."""
@@ -281,8 +281,8 @@ def check_transitions(targets: np.ndarray, outcomes: np.ndarray) -> None:
     Raises
     ------
     InputError
-        If a target is not a state, a step that succeeded has target 0 or one that did not has
-        another, or row 0 is not that of the failure state.
+        If a target is not a state, an outcome is not one of a step, a step that succeeded has
+        target 0 or one that did not has another, or row 0 is not that of the failure state.
     """
     n = len(targets)
     if targets.max(initial=0) >= n:
@@ -295,6 +295,13 @@ def check_transitions(targets: np.ndarray, outcomes: np.ndarray) -> None:
         )
     for first in range(1, n, CHECKED_ROWS):
         block = slice(first, first + CHECKED_ROWS)
+        unknown = outcomes[block] > _LAST_OUTCOME
+        if unknown.any():
+            i, s = np.argwhere(unknown)[0]
+            i += first
+            raise InputError(
+                f"outcomes[{i}, {s}]", int(outcomes[i, s]), f"a code of a step, 0 to {_LAST_OUTCOME}"
+            )
         wrong = (targets[block] == 0) == (outcomes[block] == _STEP)
         if wrong.any():
             i, s = np.argwhere(wrong)[0]
