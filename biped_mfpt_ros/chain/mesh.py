@@ -300,7 +300,9 @@ def check_transitions(targets: np.ndarray, outcomes: np.ndarray) -> None:
             i, s = np.argwhere(unknown)[0]
             i += first
             raise InputError(
-                f"outcomes[{i}, {s}]", int(outcomes[i, s]), f"a code of a step, 0 to {_LAST_OUTCOME}"
+                f"outcomes[{i}, {s}]",
+                int(outcomes[i, s]),
+                f"a code of a step, 0 to {_LAST_OUTCOME}",
             )
         wrong = (targets[block] == 0) == (outcomes[block] == _STEP)
         if wrong.any():

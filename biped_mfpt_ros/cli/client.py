@@ -32,6 +32,7 @@ _Self = TypeVar("_Self", bound="Client")  # typing has Self from Python 3.11 on
 _POLL = 0.05  # s
 _PUBLISHED = 10.0  # s, for the analysis to publish an MFPT before it is asked
 _GREET_AGAIN = 1.0  # s, until what costs nothing is asked for the second time
+_GREETED = 120.0  # s, for an answer to it, however busy the machine is
 _ON_ITS_WAY = 120.0  # s, for the last messages of a mesh to come to the analysis
 # What a recorder has to hear of a run: it finds each of them by itself, some tenths of a second
 # after its publisher, and a small mesh is grown and solved in less.
@@ -178,14 +179,13 @@ class Client:
 
     def wait_until_found(self) -> None:
         """Wait until mesher and analysis have found this client, and answer it."""
-        while not (self._compute.service_is_ready() and self._grow.server_is_ready()):
-            self.spin()
+        ready = self._grow.server_is_ready
+        self.wait(lambda: ready() and self._compute.service_is_ready(), _GREETED, "the nodes")
         none = ClientGoalHandle(
             self._grow, UUID(uuid=[1] * 16), GrowMesh.Impl.SendGoalService.Response()
         )
-        greeting = ComputeMfpt.Request(client=self._name)
-        for ask in (lambda: self._compute.call_async(greeting), none.cancel_goal_async):
-            self._result(Answer(ask, again=_GREET_AGAIN))
+        self._greeted(none.cancel_goal_async, "the mesher")
+        self._greet_analysis()
 
     def wait(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
         """Wait until a condition holds; WaitedInVain after ``timeout`` seconds."""
@@ -262,8 +262,7 @@ class Client:
         """Ask the analysis for the MFPT of a mesh at any ``sigma_s``; AnalysisFailed if in vain."""
         # A chain may cost much, so that is asked for once, when the analysis has answered what
         # costs nothing: then it has found this client.
-        greeting = ComputeMfpt.Request(client=self._name)
-        self._result(Answer(lambda: self._compute.call_async(greeting), again=_GREET_AGAIN))
+        self._greet_analysis()
         deadline = time.monotonic() + _ON_ITS_WAY
         while True:
             try:
@@ -297,6 +296,15 @@ class Client:
         if not response.success:
             raise AnalysisFailed(f"the analysis failed: {response.message}")
         return list(response.estimates)
+
+    def _greet_analysis(self) -> None:
+        """Ask the analysis what costs nothing, until it answers: it has found this client then."""
+        greeting = ComputeMfpt.Request(client=self._name)
+        self._greeted(lambda: self._compute.call_async(greeting), "the analysis")
+
+    def _greeted(self, ask: Callable[[], Future], who: str) -> None:
+        """Wait for an answer to what costs nothing."""
+        self.wait(Answer(ask, again=_GREET_AGAIN).done, _GREETED, f"an answer of {who}")
 
     def _accepted(self, action: ActionClient, goal: Any, feedback: Callable[[Any], object]) -> Any:
         """Handle of a goal, when it has been answered."""
