@@ -11,7 +11,7 @@ import math
 import mpmath
 import numpy as np
 import pytest
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, diags
 from test_markov import (
     RELATIVE,
     assert_same_bits,
@@ -156,7 +156,7 @@ def test_a_class_is_not_given_up_for_one_that_seems_to_last_longer():
 def test_long_walk_in_small_steps():
     # Without any closed part; see test_symmetric_walk_between_two_falls.
     n = 2 * aggregation.GROUPS
-    q = csr_array(diags_array([np.full(n - 1, 0.5)] * 2, offsets=[-1, 1]))
+    q = csr_array(diags([np.full(n - 1, 0.5)] * 2, offsets=[-1, 1]))
     f = np.zeros(n)
     f[[0, -1]] = 0.5
     phi = metastable_distribution(q, f, TOLERANCE)
